@@ -1,0 +1,225 @@
+"""The world's settings: one flat frozen dataclass, checked when it is made.
+
+Every quantity that the dissertation leaves open is a field here, so that no number is hidden in a
+kernel. Field names carry their unit (`_m`, `_s`, `_m_s`, `_deg`, `_steps`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+
+class ConfigError(ValueError):
+    """A setting that cannot work; the message says what, where and how to mend it."""
+
+
+MAX_HEADINGS = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldConfig:
+    """One setup (robots x groups x method) and the world it lives in.
+
+    Raises:
+      ConfigError: a value is out of range or two values contradict each other.
+    """
+
+    robots: int = 10
+    """Robots per group, the 10 of 10r x 2g; the learning robot counts."""
+    groups: int = 2
+    """Number of groups, the 2 of 10r x 2g."""
+    method: Literal["sensor"] = "sensor"
+    """State representation of the learning robot (`sensor` = M_sensor, Chapter 3)."""
+    swarm_knows_learner: bool = True
+    """Whether the swarm avoids the learning robot and counts it in its flock (M_sensor: yes)."""
+
+    sectors: int = 8
+    """q, the number of sectors per sensing region and of headings (not given in the text)."""
+    stop_action: bool = False
+    """Adds an action that keeps the learning robot where it is (ours; the text has headings only)."""
+    inner_radius_m: float = 0.5
+    """R1, radius of the inner sensing disc (Table 3.2)."""
+    outer_radius_m: float = 1.5
+    """R2, radius of the outer sensing ring; also the goal distance that means success (Table 3.2)."""
+    learner_speed_m_s: float = 1.0
+    """v, the constant speed of the learning robot (Table 3.2)."""
+    horizon_steps: int = 500
+    """eta, env steps after which an episode is cut (Table 3.2)."""
+    reward_scale: float = 1.0
+    """tau, the size of the terminal reward (Table 3.2)."""
+    reward_clock: Literal["step", "horizon"] = "step"
+    """What the step reward tau/eta divides by: the current step (3.2.3) or the horizon (Table 3.2)."""
+
+    time_step_s: float = 0.05
+    """dt, simulated time per env step."""
+    arena_radius_m: float = 6.0
+    """Radius of the circle on which group centres start; goals are antipodal."""
+    start_spacing_m: float = 0.45
+    """Edge of the square start grid of a group."""
+    start_jitter_m: float = 0.05
+    """Largest displacement of a start position from its grid point, per axis."""
+    robot_radius_m: float = 0.1
+    """Physical radius; centres closer than twice this are a collision."""
+    max_speed_m_s: float = 1.0
+    """Largest speed of a swarm robot."""
+
+    orca_radius_m: float = 0.2
+    """Radius that ORCA keeps free around a robot (at least the physical one)."""
+    orca_horizon_s: float = 2.0
+    """How far ahead ORCA avoids collisions."""
+    max_neighbours: int = 10
+    """Nearest robots that ORCA and flocking look at."""
+    neighbour_range_m: float = 1.5
+    """Robots farther away are no neighbours."""
+
+    flocking: Literal["published", "uniform"] = "published"
+    """FL-ORCA weights: the published table per state, or one weight per term in all states."""
+    separation_range_m: float = 0.395
+    """`published`: other groups' robots within this range are separated from."""
+    separation_angle_deg: float = 45.0
+    """`published`: ... and within this angle of the goal direction."""
+    separation_noise: float = 0.2
+    """`published`: random gain of the separation term against mirror deadlock."""
+    sight_range_m: float = 0.789
+    """`published`: range at which a robot of another group is seen."""
+    sight_angle_deg: float = 90.0
+    """`published`: ... and its largest angle from the goal direction."""
+    view_range_m: float = 2.63
+    """`published`: a neighbour this near can block the view of the goal."""
+    view_angle_deg: float = 20.0
+    """`published`: ... when within this angle of the goal direction."""
+    cohesion_weight: float = 0.3
+    """`uniform`: weight of the cohesion term."""
+    separation_weight: float = 1.0
+    """`uniform`: weight of the separation term."""
+    alignment_weight: float = 0.3
+    """`uniform`: weight of the alignment term."""
+    uniform_separation_range_m: float = 0.7
+    """`uniform`: any neighbour within this range is separated from."""
+    uniform_view_corridor_m: float = 0.5
+    """`uniform`: another group's robot this near the line to the goal blocks the view."""
+    uniform_slow_radius_m: float = 0.25
+    """`uniform`: robots slow down within this distance of the goal."""
+
+    def __post_init__(self) -> None:
+        _check_types(self)
+        _check_counts(self)
+        _check_lengths(self)
+        _check_start_room(self)
+
+    @property
+    def num_robots(self) -> int:
+        """Robots in one world, over all groups."""
+        return self.robots * self.groups
+
+    @property
+    def num_actions(self) -> int:
+        """Headings, plus one if there is a stop action."""
+        return self.sectors + int(self.stop_action)
+
+    @property
+    def setup(self) -> str:
+        """The setup as the dissertation writes it, such as `10r x 2g`."""
+        return f"{self.robots}r×{self.groups}g"
+
+
+def require(condition: bool, message: str) -> None:
+    """Raises ConfigError with `message` unless `condition` holds."""
+    if not condition:
+        raise ConfigError(message)
+
+
+def _check_types(config: WorldConfig) -> None:
+    defaults = {field.name: field.default for field in dataclasses.fields(config)}
+    for name, default in defaults.items():
+        value = getattr(config, name)
+        if isinstance(default, bool) or isinstance(default, str):
+            require(isinstance(value, type(default)), f"{name} must be a {type(default).__name__}, not {value!r}")
+        elif isinstance(default, int):
+            ok = isinstance(value, int) and not isinstance(value, bool)
+            require(ok, f"{name} must be a whole number, not {value!r}")
+        else:
+            ok = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+            require(ok, f"{name} must be a finite number, not {value!r}")
+    require(config.method == "sensor", f"method must be one of: sensor; not {config.method!r}")
+    require(config.flocking in ("published", "uniform"), f"flocking must be published or uniform, not {config.flocking!r}")
+    require(config.reward_clock in ("step", "horizon"), f"reward_clock must be step or horizon, not {config.reward_clock!r}")
+
+
+def _check_counts(config: WorldConfig) -> None:
+    require(
+        config.robots >= 2,
+        f"robots must be at least 2 per group (the learning robot needs one to follow), not {config.robots}",
+    )
+    require(config.groups >= 1, f"groups must be at least 1, not {config.groups}")
+    require(
+        config.num_robots <= 100_000,
+        f"robots × groups is {config.num_robots}; at most 100000 robots fit one world: lower robots or groups",
+    )
+    require(2 <= config.sectors <= MAX_HEADINGS, f"sectors must be between 2 and {MAX_HEADINGS}, not {config.sectors}")
+    require(config.horizon_steps >= 1, f"horizon_steps must be at least 1, not {config.horizon_steps}")
+    require(1 <= config.max_neighbours <= 64, f"max_neighbours must be between 1 and 64, not {config.max_neighbours}")
+
+
+POSITIVE = (
+    "inner_radius_m outer_radius_m learner_speed_m_s reward_scale time_step_s arena_radius_m start_spacing_m "
+    "robot_radius_m max_speed_m_s orca_radius_m orca_horizon_s neighbour_range_m separation_range_m sight_range_m "
+    "view_range_m uniform_separation_range_m uniform_view_corridor_m uniform_slow_radius_m"
+).split()
+NON_NEGATIVE = "start_jitter_m separation_noise cohesion_weight separation_weight alignment_weight".split()
+ANGLES = "separation_angle_deg sight_angle_deg view_angle_deg".split()
+
+
+def _check_lengths(config: WorldConfig) -> None:
+    for name in POSITIVE:
+        require(getattr(config, name) > 0, f"{name} must be greater than 0, not {getattr(config, name)}")
+    for name in NON_NEGATIVE:
+        require(getattr(config, name) >= 0, f"{name} must not be negative, not {getattr(config, name)}")
+    for name in ANGLES:
+        require(0 < getattr(config, name) <= 180, f"{name} must be in (0, 180], not {getattr(config, name)}")
+    require(
+        config.inner_radius_m < config.outer_radius_m,
+        f"inner_radius_m (R1 = {config.inner_radius_m}) must be smaller than outer_radius_m (R2 = {config.outer_radius_m})",
+    )
+    require(
+        config.orca_radius_m >= config.robot_radius_m,
+        f"orca_radius_m ({config.orca_radius_m}) must be at least robot_radius_m ({config.robot_radius_m}), or ORCA steers into collisions",
+    )
+    step_m = config.time_step_s * max(config.max_speed_m_s, config.learner_speed_m_s)
+    require(
+        step_m <= 2 * config.robot_radius_m,
+        f"time_step_s ({config.time_step_s}) lets a robot jump {step_m:.3g} m in a step, past another robot: "
+        f"keep time_step_s × speed at most 2 × robot_radius_m ({2 * config.robot_radius_m:.3g} m)",
+    )
+
+
+def start_grid_radius_m(config: WorldConfig) -> float:
+    """Distance from a group's centre to its farthest possible start position."""
+    columns = math.ceil(math.sqrt(config.robots))
+    rows = math.ceil(config.robots / columns)
+    half_m = 0.5 * config.start_spacing_m
+    return math.hypot((columns - 1) * half_m + config.start_jitter_m, (rows - 1) * half_m + config.start_jitter_m)
+
+
+def _check_start_room(config: WorldConfig) -> None:
+    gap_m = config.start_spacing_m - 2 * config.start_jitter_m
+    require(
+        gap_m >= 2 * config.robot_radius_m,
+        f"robots would overlap at the start: start_spacing_m ({config.start_spacing_m}) less twice start_jitter_m "
+        f"must be at least 2 × robot_radius_m ({2 * config.robot_radius_m:.3g} m)",
+    )
+    require(
+        config.start_spacing_m + 2 * config.start_jitter_m < config.outer_radius_m,
+        f"the learning robot would start lost: start_spacing_m ({config.start_spacing_m}) plus twice start_jitter_m "
+        f"must be below outer_radius_m (R2 = {config.outer_radius_m})",
+    )
+    room_m = 2 * config.arena_radius_m * math.sin(math.pi / config.groups) if config.groups > 1 else math.inf
+    need_m = 2 * (start_grid_radius_m(config) + config.robot_radius_m)
+    require(
+        room_m >= need_m,
+        f"{config.setup} does not fit: neighbouring start grids need {need_m:.2f} m but their centres are {room_m:.2f} m apart; "
+        f"raise arena_radius_m or lower robots or groups",
+    )

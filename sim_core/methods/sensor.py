@@ -1,0 +1,162 @@
+"""M_sensor: counts of robots in sectors around the learning robot (Chapter 3).
+
+Two sensing regions, the disc of radius R1 and the ring from R1 to R2, are cut into q sectors
+(Figure 3.1). The state is, per region and sector, the number of own-group robots less the number of
+other-group robots (3.2.1). Sectors and headings are in the world frame.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_core.config import WorldConfig
+from sim_core.jit import kernel
+from sim_core.methods.base import Method
+from sim_core.outcomes import Outcome, end_of_step
+from sim_core.state import WorldState
+
+COUNT_LIMIT = 127
+"""Counts saturate here, so that they fit int8."""
+
+_RUNNING, _GOAL, _TIMEOUT = int(Outcome.RUNNING), int(Outcome.GOAL), int(Outcome.TIMEOUT)
+
+
+class SensorParams(NamedTuple):
+    """Constants of M_sensor."""
+
+    robots: int
+    sectors: int
+    inner_sq: Any
+    outer_sq: Any
+    outer_m: Any
+    collision_sq: Any
+    horizon_steps: int
+    reward_scale: float
+    clock_is_step: bool
+
+
+def heading_velocities(config: WorldConfig, dtype: Any) -> NDArray[Any]:
+    """Velocity of every action `[num_actions, 2]`, m/s (Eq. 3.3 and 3.4).
+
+    Action a in 0..q-1 moves towards the centre of sector a. The text counts a from 1 to q+1, of which the
+    last repeats the first heading. A stop action, if there is one, comes last.
+    """
+    q = config.sectors
+    alpha = math.pi / q + np.arange(q) * (2 * math.pi / q) - math.pi
+    velocity = config.learner_speed_m_s * np.stack([np.cos(alpha), np.sin(alpha)], axis=1)
+    if config.stop_action:
+        velocity = np.concatenate([velocity, np.zeros((1, 2))])
+    return velocity.astype(dtype)
+
+
+@kernel
+def sector_of(dx, dy, sectors):
+    """Sector 0..sectors-1 of the direction (dx, dy); sector 0 begins at angle -pi."""
+    turn = (math.atan2(dy, dx) + math.pi) / (2.0 * math.pi)
+    return min(int(turn * sectors), sectors - 1)
+
+
+@kernel
+def _perceive(state, mask, out, p):
+    for world in range(mask.shape[0]):
+        if not mask[world]:
+            continue
+        pos_x, pos_y = state.pos_x[world], state.pos_y[world]
+        learner = state.learner[world]
+        out[world, :] = 0
+        for other in range(pos_x.shape[0]):
+            dx, dy = pos_x[other] - pos_x[learner], pos_y[other] - pos_y[learner]
+            dist_sq = dx * dx + dy * dy
+            if other == learner or dist_sq >= p.outer_sq:
+                continue
+            cell = sector_of(dx, dy, p.sectors) + (0 if dist_sq < p.inner_sq else p.sectors)
+            step = 1 if other // p.robots == learner // p.robots else -1
+            out[world, cell] = min(max(out[world, cell] + step, -COUNT_LIMIT), COUNT_LIMIT)
+
+
+@kernel
+def _outcome(state, out, p):
+    for world in range(out.shape[0]):
+        ended = end_of_step(
+            state.learner[world],
+            p.robots,
+            state.pos_x[world],
+            state.pos_y[world],
+            state.goal_x[world],
+            state.goal_y[world],
+            p.collision_sq,
+            p.outer_m,
+        )
+        if ended == _RUNNING and state.steps[world] >= p.horizon_steps:
+            ended = _TIMEOUT
+        out[world] = ended
+
+
+@kernel
+def _reward(state, outcome, out, p):
+    for world in range(out.shape[0]):
+        learner = state.learner[world]
+        group = learner // p.robots
+        dx = state.pos_x[world, learner] - state.goal_x[world, group]
+        dy = state.pos_y[world, learner] - state.goal_y[world, group]
+        distance_m = np.sqrt(dx * dx + dy * dy)
+        closer = distance_m < state.goal_distance_m[world]
+        state.goal_distance_m[world] = distance_m
+        if outcome[world] == _RUNNING or outcome[world] == _TIMEOUT:
+            clock = state.steps[world] if p.clock_is_step else p.horizon_steps
+            reward = p.reward_scale / clock if closer else -p.reward_scale / clock
+        else:
+            reward = p.reward_scale if outcome[world] == _GOAL else -p.reward_scale
+        out[world] = reward
+        state.episode_return[world] += reward
+
+
+@kernel
+def _velocity(table, action, out_x, out_y):
+    for world in range(action.shape[0]):
+        out_x[world] = table[action[world], 0]
+        out_y[world] = table[action[world], 1]
+
+
+class SensorMethod(Method):
+    """M_sensor: 2q counts, velocity u_nn, Table 3.1's reward, lost or collision as failures."""
+
+    observation_dtype = np.int8
+    observation_limit = COUNT_LIMIT
+
+    def __init__(self, config: WorldConfig) -> None:
+        """Takes its constants from `config`."""
+        self.observation_shape = (2 * config.sectors,)
+        self._velocities = heading_velocities(config, np.float32)
+        real = np.float32
+        self._params = SensorParams(
+            robots=config.robots,
+            sectors=config.sectors,
+            inner_sq=real(config.inner_radius_m) ** 2,
+            outer_sq=real(config.outer_radius_m) ** 2,
+            outer_m=real(config.outer_radius_m),
+            collision_sq=real(2 * config.robot_radius_m) ** 2,
+            horizon_steps=config.horizon_steps,
+            reward_scale=float(config.reward_scale),
+            clock_is_step=config.reward_clock == "step",
+        )
+
+    def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
+        """Eq. 3.4: constant speed towards the chosen sector's centre."""
+        _velocity(self._velocities, action, out_x, out_y)
+
+    def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
+        """3.2.1: `[num_worlds, 2q]` counts, the inner disc's q sectors first."""
+        _perceive(state, mask, out, self._params)
+
+    def outcome(self, state: WorldState, out: NDArray[np.int8]) -> None:
+        """3.2.1: goal, collision, lost or captured; timeout at the horizon (a truncation)."""
+        _outcome(state, out, self._params)
+
+    def reward(self, state: WorldState, outcome: NDArray[np.int8], out: NDArray[np.float32]) -> None:
+        """Table 3.1, with the robot's own distance to the goal as "closer"; a timeout is an ordinary step."""
+        _reward(state, outcome, out, self._params)

@@ -1,0 +1,80 @@
+"""How an episode ends: mutually exclusive outcomes, defined once for every method.
+
+Spec of the task (3.1, 4.1): success is the mean distance of the learning robot's group to its goal
+(Eq. 3.2) below R2. Failures are told apart as lost and captured (Figure 3.3), collision and timeout.
+Where two hold in one step, the first of collision, goal, lost or captured, timeout counts.
+"""
+
+from __future__ import annotations
+
+import enum
+
+import numpy as np
+
+from sim_core.jit import kernel
+
+
+class Outcome(enum.IntEnum):
+    """Why an episode ended; RUNNING while it has not."""
+
+    RUNNING = 0
+    GOAL = 1
+    LOST = 2
+    CAPTURED = 3
+    COLLISION = 4
+    TIMEOUT = 5
+
+
+ENDED = tuple(outcome for outcome in Outcome if outcome is not Outcome.RUNNING)
+OUTCOME_NAMES = tuple(outcome.name.lower() for outcome in Outcome)
+
+_GOAL, _LOST, _CAPTURED = int(Outcome.GOAL), int(Outcome.LOST), int(Outcome.CAPTURED)
+_COLLISION, _RUNNING = int(Outcome.COLLISION), int(Outcome.RUNNING)
+
+
+@kernel
+def collides(robot, pos_x, pos_y, distance_sq):
+    """Whether any other robot's centre is nearer than the square root of `distance_sq` (m^2)."""
+    for other in range(pos_x.shape[0]):
+        dx, dy = pos_x[other] - pos_x[robot], pos_y[other] - pos_y[robot]
+        if other != robot and dx * dx + dy * dy < distance_sq:
+            return True
+    return False
+
+
+@kernel
+def sensed(robot, robots, pos_x, pos_y, range_sq):
+    """(own, others): robots of the own and of other groups within the sensing range."""
+    own, others = 0, 0
+    for other in range(pos_x.shape[0]):
+        dx, dy = pos_x[other] - pos_x[robot], pos_y[other] - pos_y[robot]
+        if other == robot or dx * dx + dy * dy >= range_sq:
+            continue
+        if other // robots == robot // robots:
+            own += 1
+        else:
+            others += 1
+    return own, others
+
+
+@kernel
+def group_goal_distance_m(group, robots, pos_x, pos_y, goal_x, goal_y):
+    """Mean distance of a group's robots to its goal (Eq. 3.2), metres."""
+    total = 0.0
+    for i in range(group * robots, (group + 1) * robots):
+        dx, dy = pos_x[i] - goal_x[group], pos_y[i] - goal_y[group]
+        total += np.sqrt(dx * dx + dy * dy)
+    return total / robots
+
+
+@kernel
+def end_of_step(robot, robots, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m):
+    """Outcome of one world after a step of a robot that is lost once it senses no own robot."""
+    if collides(robot, pos_x, pos_y, collision_sq):
+        return _COLLISION
+    if group_goal_distance_m(robot // robots, robots, pos_x, pos_y, goal_x, goal_y) < range_m:
+        return _GOAL
+    own, others = sensed(robot, robots, pos_x, pos_y, range_m * range_m)
+    if own == 0:
+        return _CAPTURED if others > 0 else _LOST
+    return _RUNNING

@@ -1,0 +1,60 @@
+"""How separated the groups are (Eq. 3.1) and how near their goals (Eq. 3.2)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def mean_pairwise_distances_m(pos: NDArray[np.floating], groups: int) -> NDArray[np.float64]:
+    """Mean distance d_XY between the robots of every two groups (Eq. 3.1).
+
+    Args:
+      pos: `[..., num_robots, 2]`, metres; groups are equal contiguous blocks of robots.
+      groups: number of groups.
+
+    Returns:
+      `[..., groups, groups]` float64, metres. The diagonal is d_XX, where, as in the equation, each
+      robot's zero distance to itself counts.
+    """
+    points = np.asarray(pos, np.float64)
+    delta = points[..., :, None, :] - points[..., None, :, :]
+    distance = np.sqrt((delta**2).sum(-1))
+    size = points.shape[-2] // groups
+    blocks = distance.reshape(*distance.shape[:-2], groups, size, groups, size)
+    return blocks.mean(axis=(-3, -1))
+
+
+def segregated_fraction(pos: NDArray[np.floating], groups: int) -> NDArray[np.float64]:
+    """Share of group pairs X != Y with d_XX < d_XY and d_YY < d_XY; 1 where there is one group.
+
+    Args:
+      pos: `[..., num_robots, 2]`, metres.
+      groups: number of groups.
+
+    Returns:
+      `[...]` float64 in [0, 1]; 1 means that all groups are segregated.
+    """
+    mean = mean_pairwise_distances_m(pos, groups)
+    if groups == 1:
+        return np.ones(mean.shape[:-2])
+    own = np.diagonal(mean, axis1=-2, axis2=-1)
+    apart = (own[..., :, None] < mean) & (own[..., None, :] < mean)
+    first, second = np.triu_indices(groups, 1)
+    return apart[..., first, second].mean(-1)
+
+
+def mean_goal_distance_m(pos: NDArray[np.floating], goal: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Mean distance of each group to its goal (Eq. 3.2).
+
+    Args:
+      pos: `[..., num_robots, 2]`, metres.
+      goal: `[..., groups, 2]`, metres.
+
+    Returns:
+      `[..., groups]` float64, metres.
+    """
+    points = np.asarray(pos, np.float64)
+    groups = goal.shape[-2]
+    by_group = points.reshape(*points.shape[:-2], groups, -1, 2)
+    return np.sqrt(((by_group - np.asarray(goal, np.float64)[..., :, None, :]) ** 2).sum(-1)).mean(-1)

@@ -1,0 +1,85 @@
+"""The arrays of a batch of worlds, as named tuples that kernels take whole."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sim_core.config import WorldConfig
+
+
+class WorldState(NamedTuple):
+    """All that a batch of worlds needs to go on; structure of arrays, robot i is of group i // robots.
+
+    Shapes: pos_*, vel_* `[num_worlds, num_robots]` (metres, m/s); goal_* `[num_worlds, groups]`; learner,
+    steps `[num_worlds]` int32; goal_distance_m `[num_worlds]` (the learning robot's, before the step);
+    episode_return `[num_worlds]` float64; rng `[num_worlds]` uint64; machine `[num_worlds, num_robots]`
+    int8, the FL-ORCA state of the last step.
+    """
+
+    pos_x: Any
+    pos_y: Any
+    vel_x: Any
+    vel_y: Any
+    goal_x: Any
+    goal_y: Any
+    learner: Any
+    steps: Any
+    goal_distance_m: Any
+    episode_return: Any
+    rng: Any
+    machine: Any
+
+
+class Scratch(NamedTuple):
+    """Work space of one world's step, reused by all worlds of the batch."""
+
+    neighbours: Any
+    counts: Any
+    distances_sq: Any
+    flags: Any
+    leaders: Any
+    pref_x: Any
+    pref_y: Any
+    new_vx: Any
+    new_vy: Any
+    lines: Any
+    projected: Any
+
+
+def empty_state(config: WorldConfig, num_worlds: int, dtype: Any) -> WorldState:
+    """Zeroed arrays for `num_worlds` worlds of `config`; positions are of `dtype`."""
+    robots, groups = (num_worlds, config.num_robots), (num_worlds, config.groups)
+    return WorldState(
+        pos_x=np.zeros(robots, dtype),
+        pos_y=np.zeros(robots, dtype),
+        vel_x=np.zeros(robots, dtype),
+        vel_y=np.zeros(robots, dtype),
+        goal_x=np.zeros(groups, dtype),
+        goal_y=np.zeros(groups, dtype),
+        learner=np.zeros(num_worlds, np.int32),
+        steps=np.zeros(num_worlds, np.int32),
+        goal_distance_m=np.zeros(num_worlds, dtype),
+        episode_return=np.zeros(num_worlds, np.float64),
+        rng=np.zeros(num_worlds, np.uint64),
+        machine=np.zeros(robots, np.int8),
+    )
+
+
+def empty_scratch(config: WorldConfig, dtype: Any) -> Scratch:
+    """Work space for one world of `config`."""
+    num_robots, k = config.num_robots, config.max_neighbours
+    return Scratch(
+        neighbours=np.zeros((num_robots, k), np.int32),
+        counts=np.zeros(num_robots, np.int32),
+        distances_sq=np.zeros(k, dtype),
+        flags=np.zeros(num_robots, np.uint8),
+        leaders=np.zeros(num_robots, np.int32),
+        pref_x=np.zeros(num_robots, dtype),
+        pref_y=np.zeros(num_robots, dtype),
+        new_vx=np.zeros(num_robots, dtype),
+        new_vy=np.zeros(num_robots, dtype),
+        lines=np.zeros((k, 4), dtype),
+        projected=np.zeros((k, 4), dtype),
+    )

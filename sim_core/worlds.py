@@ -1,0 +1,128 @@
+"""A batch of worlds with its method: reset, step, perceive; the plain class under the environments."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_core.config import WorldConfig
+from sim_core.methods import make_method
+from sim_core.outcomes import Outcome
+from sim_core.rng import world_streams
+from sim_core.scenario import scenario_params
+from sim_core.state import WorldState, empty_scratch, empty_state
+from sim_core.step import advance, restart, swarm_params
+
+
+class StepResult(NamedTuple):
+    """What a step gives back, one entry a world.
+
+    `observation` is the state reached by the step, also where the episode ended. Shapes `[num_worlds, ...]`;
+    reward float32, outcome int8 (see Outcome), steps int32, episode_return float64.
+    """
+
+    observation: NDArray[Any]
+    reward: NDArray[np.float32]
+    outcome: NDArray[np.int8]
+    steps: NDArray[np.int32]
+    episode_return: NDArray[np.float64]
+
+
+class WorldBatch:
+    """Worlds of one setup that step together; no world influences another.
+
+    Args:
+      config: the setup.
+      num_worlds: size of the batch.
+    """
+
+    def __init__(self, config: WorldConfig, num_worlds: int) -> None:
+        self.config = config
+        self.num_worlds = num_worlds
+        self.method = make_method(config)
+        self.state: WorldState = empty_state(config, num_worlds, np.float32)
+        self._scratch = empty_scratch(config, np.float32)
+        self._swarm = swarm_params(config, np.float32)
+        self._scenario = scenario_params(config)
+        self._command_x = np.zeros(num_worlds, np.float32)
+        self._command_y = np.zeros(num_worlds, np.float32)
+        self._observation = np.zeros((num_worlds, *self.method.observation_shape), self.method.observation_dtype)
+        self._reward = np.zeros(num_worlds, np.float32)
+        self._outcome = np.zeros(num_worlds, np.int8)
+        self._all = np.ones(num_worlds, np.bool_)
+
+    def seed(self, seeds: list[int]) -> None:
+        """Gives world i the random stream of `seeds[i]`."""
+        self.state.rng[:] = [world_streams(seed, 1)[0] for seed in seeds]
+
+    def reset(self, mask: NDArray[np.bool_] | None = None) -> NDArray[Any]:
+        """Starts new episodes where `mask` `[num_worlds]` is set (everywhere by default).
+
+        Returns:
+          Observations of all worlds, a copy.
+        """
+        mask = self._all if mask is None else mask
+        restart(self.state, mask, self._scenario)
+        self.method.perceive(self.state, mask, self._observation)
+        return self._observation.copy()
+
+    def step(self, action: NDArray[np.int64] | None) -> StepResult:
+        """Moves every world by one step; ended worlds are not restarted.
+
+        Args:
+          action: `[num_worlds]`, or None to let FL-ORCA drive the learning robot too.
+
+        Returns:
+          StepResult of copies.
+        """
+        if action is not None:
+            self.method.velocity(self.state, action, self._command_x, self._command_y)
+        advance(self.state, self._scratch, self._command_x, self._command_y, action is not None, self._swarm)
+        self.method.outcome(self.state, self._outcome)
+        self.method.reward(self.state, self._outcome, self._reward)
+        self.method.perceive(self.state, self._all, self._observation)
+        return StepResult(
+            self._observation.copy(),
+            self._reward.copy(),
+            self._outcome.copy(),
+            self.state.steps.copy(),
+            self.state.episode_return.copy(),
+        )
+
+    def positions(self) -> NDArray[np.float32]:
+        """Positions `[num_worlds, num_robots, 2]`, metres."""
+        return np.stack([self.state.pos_x, self.state.pos_y], axis=-1)
+
+    def goals(self) -> NDArray[np.float32]:
+        """Goals `[num_worlds, groups, 2]`, metres."""
+        return np.stack([self.state.goal_x, self.state.goal_y], axis=-1)
+
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """Copies of all arrays that a checkpoint needs, by name."""
+        return {name: array.copy() for name, array in self.state._asdict().items()}
+
+    def set_state(self, saved: dict[str, NDArray[Any]]) -> NDArray[Any]:
+        """Takes up saved arrays; returns the observations there.
+
+        Raises:
+          ValueError: an array is missing or has another shape or dtype.
+        """
+        for name, array in self.state._asdict().items():
+            new = saved.get(name)
+            if new is None or new.shape != array.shape or new.dtype != array.dtype:
+                raise ValueError(f"saved worlds do not fit: {name} should be {array.dtype}{array.shape}")
+            array[...] = new
+        self.method.perceive(self.state, self._all, self._observation)
+        return self._observation.copy()
+
+
+def is_done(outcome: NDArray[np.int8]) -> NDArray[np.bool_]:
+    """Where an episode has ended."""
+    return outcome != Outcome.RUNNING
+
+
+def is_terminated(outcome: NDArray[np.int8]) -> NDArray[np.bool_]:
+    """Where an episode has ended for a reason of the task, not of the clock."""
+    return is_done(outcome) & (outcome != Outcome.TIMEOUT)
