@@ -4,7 +4,9 @@ J. van den Berg, S. J. Guy, M. Lin, D. Manocha, "Reciprocal n-body collision avo
 A half-plane is a point and a unit direction; permitted velocities lie to its left. Half-planes are
 rows of a scratch array `lines` `[max_neighbours, 4]`: point x, point y, direction x, direction y.
 Kernels compute in the dtype of their arguments (float32 in the worlds), allocate nothing, and take
-every constant from `ORCAParams` so that no float64 literal widens the arithmetic.
+every constant from `ORCAParams` so that no float64 literal widens the arithmetic. The order of operations
+is that of the reference implementation (RVO2), reciprocals included, so that float32 results are equal to
+its own; exceptions are robots that coincide and the speed limit (see `orca_velocity`), where it fails.
 """
 
 from __future__ import annotations
@@ -55,7 +57,7 @@ def half_plane(rel_x, rel_y, rel_vx, rel_vy, vx, vy, tie_sign, p, lines, row):
       rel_x, rel_y: the neighbour's position relative to the robot, metres.
       rel_vx, rel_vy: the robot's velocity relative to the neighbour, m/s.
       vx, vy: the robot's velocity, m/s.
-      tie_sign: +1 or -1, opposite for the two robots of a pair; side taken when they coincide exactly.
+      tie_sign: +1 or -1, opposite for the two robots of a pair; side taken when they coincide.
       p: ORCAParams.
       lines: scratch `[max_neighbours, 4]`.
       row: row to write.
@@ -72,19 +74,21 @@ def half_plane(rel_x, rel_y, rel_vx, rel_vy, vx, vy, tie_sign, p, lines, row):
     if not apart or (dot < p.zero and dot * dot > radius_sq * w_sq):
         w_length = np.sqrt(w_sq)
         unit_x, unit_y = tie_sign, p.zero
-        if w_length > p.zero:
-            unit_x, unit_y = w_x / w_length, w_y / w_length
+        if w_length > p.epsilon * p.epsilon * p.epsilon:  # below it, squares underflow: no direction is left
+            scale = p.one / w_length
+            unit_x, unit_y = w_x * scale, w_y * scale
         dir_x, dir_y = unit_y, -unit_x
         push = radius * inverse_time - w_length
         u_x, u_y = push * unit_x, push * unit_y
     else:
         leg = np.sqrt(dist_sq - radius_sq)
+        scale = p.one / dist_sq
         if rel_x * w_y - rel_y * w_x > p.zero:
-            dir_x = (rel_x * leg - rel_y * radius) / dist_sq
-            dir_y = (rel_x * radius + rel_y * leg) / dist_sq
+            dir_x = (rel_x * leg - rel_y * radius) * scale
+            dir_y = (rel_x * radius + rel_y * leg) * scale
         else:
-            dir_x = -(rel_x * leg + rel_y * radius) / dist_sq
-            dir_y = -(-rel_x * radius + rel_y * leg) / dist_sq
+            dir_x = -(rel_x * leg + rel_y * radius) * scale
+            dir_y = -(rel_y * leg - rel_x * radius) * scale
         along = rel_vx * dir_x + rel_vy * dir_y
         u_x, u_y = along * dir_x - rel_vx, along * dir_y - rel_vy
     lines[row, 0] = vx + p.half * u_x
@@ -142,8 +146,8 @@ def linear_program_2(lines, count, max_speed, opt_x, opt_y, direction_opt, p):
     if direction_opt:
         x, y = opt_x * max_speed, opt_y * max_speed
     elif opt_sq > max_speed * max_speed:
-        length = np.sqrt(opt_sq)
-        x, y = opt_x / length * max_speed, opt_y / length * max_speed
+        scale = p.one / np.sqrt(opt_sq)
+        x, y = opt_x * scale * max_speed, opt_y * scale * max_speed
     else:
         x, y = opt_x, opt_y
     for i in range(count):
@@ -173,9 +177,9 @@ def _project_half_planes(lines, row, projected, p):
             projected[count, 0] = lines[row, 0] + t * dx
             projected[count, 1] = lines[row, 1] + t * dy
         new_dx, new_dy = lines[j, 2] - dx, lines[j, 3] - dy
-        length = np.sqrt(new_dx * new_dx + new_dy * new_dy)
-        projected[count, 2] = new_dx / length
-        projected[count, 3] = new_dy / length
+        scale = p.one / np.sqrt(new_dx * new_dx + new_dy * new_dy)
+        projected[count, 2] = new_dx * scale
+        projected[count, 3] = new_dy * scale
         count += 1
     return count
 
@@ -211,7 +215,9 @@ def orca_velocity(robot, pos_x, pos_y, vel_x, vel_y, neighbours, count, pref_x, 
       p: ORCAParams.
 
     Returns:
-      (x, y): the new velocity, m/s, no longer than `p.max_speed_m_s` up to rounding.
+      (x, y): the new velocity, m/s, no longer than `p.max_speed_m_s` up to rounding. The third program
+      loses digits where half-planes are nearly parallel and can leave the speed disc; its result is set
+      back onto it.
     """
     for k in range(count):
         other = neighbours[k]
@@ -231,4 +237,8 @@ def orca_velocity(robot, pos_x, pos_y, vel_x, vel_y, neighbours, count, pref_x, 
     failed, x, y = linear_program_2(lines, count, p.max_speed_m_s, pref_x, pref_y, False, p)
     if failed < count:
         x, y = linear_program_3(lines, count, failed, p.max_speed_m_s, x, y, projected, p)
+        speed_sq, limit_sq = x * x + y * y, p.max_speed_m_s * p.max_speed_m_s
+        if speed_sq > limit_sq + limit_sq * p.epsilon:
+            scale = p.max_speed_m_s / np.sqrt(speed_sq)
+            x, y = x * scale, y * scale
     return x, y

@@ -1,0 +1,42 @@
+"""How much a rollout worker explores: one schedule for all, or a ladder over workers.
+
+Every rate is a function of counters that a checkpoint holds, so that a resumed run goes on where it was.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Exploration(NamedTuple):
+    """Settings of epsilon-greedy exploration (see RunConfig for their meaning)."""
+
+    kind: Literal["schedule", "ladder"]
+    start: float
+    end: float
+    decay_env_steps: int
+    ladder_base: float
+    ladder_exponent: float
+
+
+def epsilon(exploration: Exploration, env_steps: int, worker_id: int, workers: int) -> float:
+    """The worker's exploration rate after `env_steps` env steps of the whole run.
+
+    The ladder is Ape-X's (Horgan et al. 2018, Section 4.1): epsilon_i = base^(1 + i / (N - 1) * exponent).
+    """
+    if exploration.kind == "ladder":
+        rung = worker_id / (workers - 1) if workers > 1 else 0.0
+        return float(exploration.ladder_base ** (1 + rung * exploration.ladder_exponent))
+    done = min(1.0, env_steps / exploration.decay_env_steps)
+    return exploration.start + done * (exploration.end - exploration.start)
+
+
+def explore(
+    greedy: NDArray[np.int64], rate: float, num_actions: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Replaces each of `greedy` `[batch]` by a uniform action with probability `rate`."""
+    random = rng.integers(num_actions, size=len(greedy))
+    return np.where(rng.random(len(greedy)) < rate, random, greedy)

@@ -1,0 +1,212 @@
+"""The run's settings: one flat frozen dataclass beside the world's, checked when it is made."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from actors.exploration import Exploration
+from actors.vector_env import EnvSpec
+from sim_core import ENV_ID
+from sim_core.config import ConfigError, WorldConfig, require
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """All that decides what a run learns; where it runs and is stored is no part of it.
+
+    Raises:
+      ConfigError: a value is out of range or two values contradict each other.
+    """
+
+    world: WorldConfig = field(default_factory=WorldConfig)
+    """The setup and its world (used when env_id is ours)."""
+    env_id: str = ENV_ID
+    """Gymnasium id of the environment; any with Box observations and Discrete actions."""
+    seed: int = 0
+    """Seed of every random stream of the run."""
+    engine: Literal["ray", "process"] = "ray"
+    """Ray actors, or everything in one process (deterministic, for tests and debugging)."""
+    total_env_steps: int = 4_000_000
+    """Env steps to train for, over all workers."""
+
+    workers: int = 1
+    """Rollout workers."""
+    envs_per_worker: int = 64
+    """Environments that one rollout worker steps at once."""
+    steps_per_block: int = 32
+    """Env steps of each environment in one block of transitions."""
+    exploration: Literal["schedule", "ladder"] = "schedule"
+    """One falling epsilon for all workers, or Ape-X's ladder of constant ones."""
+    epsilon_start: float = 1.0
+    """Schedule: exploration rate at the start."""
+    epsilon_end: float = 0.05
+    """Schedule: exploration rate after the decay (Table 3.2)."""
+    epsilon_decay_env_steps: int = 400_000
+    """Schedule: env steps over which the rate falls linearly."""
+    ladder_base: float = 0.4
+    """Ladder: rate of the most exploring worker."""
+    ladder_exponent: float = 7.0
+    """Ladder: how steeply rates fall from worker to worker."""
+
+    replay_shards: int = 1
+    """Replay shards."""
+    replay_placement: Literal["learner", "actors"] = "learner"
+    """Shards in the learner's process, or each as a Ray actor of its own."""
+    replay_capacity: int = 500_000
+    """Transitions that all shards hold together."""
+    min_replay: int = 20_000
+    """Transitions that must be stored before the first update."""
+    samples_per_insert: float = 4.0
+    """How often a stored transition is sampled on average (Reverb's rate limiter)."""
+
+    algorithm: Literal["double_dqn", "dqn"] = "double_dqn"
+    """Target of the update: Double DQN (Algorithm 2) or DQN (Algorithm 1)."""
+    hidden_sizes: tuple[int, ...] = (128, 128)
+    """Width of the Q-network's hidden layers."""
+    discount: float = 0.99
+    """gamma per env step (the text's lambda = 0.001 cannot be a discount)."""
+    n_step: int = 3
+    """Env steps that a transition spans."""
+    batch_size: int = 256
+    """Transitions per update."""
+    updates_per_call: int = 32
+    """Updates between two publications of the weights."""
+    learning_rate: float = 1e-3
+    """Adam's learning rate (the text's lambda)."""
+    target_update_interval: int = 500
+    """Updates between two copies of the online to the target network (C)."""
+    max_gradient_norm: float = 10.0
+    """Gradients are scaled down to this norm."""
+
+    eval_every_env_steps: int = 500_000
+    """Env steps between two evaluations during training."""
+    eval_episodes: int = 100
+    """Greedy episodes of an evaluation during training."""
+    final_eval_episodes: int = 1_000
+    """Greedy episodes of the evaluation at the end."""
+    log_every_env_steps: int = 20_000
+    """Env steps between two rows of training metrics."""
+    checkpoint_every_env_steps: int = 500_000
+    """Env steps between two checkpoints."""
+    keep_checkpoints: int = 2
+    """Newest checkpoints that are kept."""
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+        _check_choices(self)
+        _check_pairs(self)
+
+    @property
+    def env(self) -> EnvSpec:
+        """The environment of rollout workers and evaluators."""
+        return EnvSpec(self.env_id, self.world)
+
+    @property
+    def epsilon_settings(self) -> Exploration:
+        """Settings of exploration as rollout workers take them."""
+        return Exploration(
+            self.exploration,
+            self.epsilon_start,
+            self.epsilon_end,
+            self.epsilon_decay_env_steps,
+            self.ladder_base,
+            self.ladder_exponent,
+        )
+
+    @property
+    def block_env_steps(self) -> int:
+        """Env steps of one block."""
+        return self.envs_per_worker * self.steps_per_block
+
+
+AT_LEAST_ONE = (
+    "total_env_steps workers envs_per_worker steps_per_block epsilon_decay_env_steps replay_shards replay_capacity "
+    "min_replay n_step batch_size updates_per_call target_update_interval eval_every_env_steps eval_episodes "
+    "final_eval_episodes log_every_env_steps checkpoint_every_env_steps keep_checkpoints"
+).split()
+CHOICES = {
+    "engine": ("ray", "process"),
+    "exploration": ("schedule", "ladder"),
+    "replay_placement": ("learner", "actors"),
+    "algorithm": ("double_dqn", "dqn"),
+}
+
+
+def _check_ranges(config: RunConfig) -> None:
+    for name in [*AT_LEAST_ONE, "seed"]:
+        value = getattr(config, name)
+        require(isinstance(value, int) and not isinstance(value, bool), f"{name} must be a whole number, not {value!r}")
+    for name in AT_LEAST_ONE:
+        require(getattr(config, name) >= 1, f"{name} must be at least 1, not {getattr(config, name)}")
+    require(0 <= config.seed < 2**31, f"seed must be in 0..{2**31 - 1}, not {config.seed}")
+    for name in ("epsilon_start", "epsilon_end", "ladder_base"):
+        require(0 <= getattr(config, name) <= 1, f"{name} must be between 0 and 1, not {getattr(config, name)}")
+    require(0 < config.discount <= 1, f"discount must be in (0, 1], not {config.discount}")
+    for name in ("samples_per_insert", "learning_rate", "max_gradient_norm"):
+        require(getattr(config, name) > 0, f"{name} must be greater than 0, not {getattr(config, name)}")
+    require(config.ladder_exponent >= 0, f"ladder_exponent must not be negative, not {config.ladder_exponent}")
+    sizes = config.hidden_sizes
+    require(
+        len(sizes) > 0 and all(isinstance(size, int) and size >= 1 for size in sizes),
+        f"hidden_sizes must be one or more widths of at least 1, not {sizes}",
+    )
+
+
+def _check_choices(config: RunConfig) -> None:
+    for name, choices in CHOICES.items():
+        value = getattr(config, name)
+        require(value in choices, f"{name} must be one of {', '.join(choices)}; not {value!r}")
+
+
+def _check_pairs(config: RunConfig) -> None:
+    require(
+        config.replay_capacity >= config.replay_shards * config.block_env_steps,
+        f"replay_capacity ({config.replay_capacity}) must hold a block of {config.block_env_steps} transitions in each of "
+        f"{config.replay_shards} shards",
+    )
+    require(
+        config.min_replay <= config.replay_capacity,
+        f"min_replay ({config.min_replay}) must not exceed replay_capacity ({config.replay_capacity})",
+    )
+    require(
+        config.min_replay < config.total_env_steps,
+        f"min_replay ({config.min_replay}) must be below total_env_steps ({config.total_env_steps}), or nothing is learned",
+    )
+
+
+def to_dict(config: RunConfig) -> dict[str, Any]:
+    """The config as nested plain values for JSON and TOML."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(values: dict[str, Any]) -> RunConfig:
+    """The config of nested plain values.
+
+    Raises:
+      ConfigError: a key is unknown, or a value cannot work.
+    """
+    world = values.get("world", {})
+    for given, known, where in (
+        (values, RunConfig.__dataclass_fields__, "config"),
+        (world, WorldConfig.__dataclass_fields__, "config section [world]"),
+    ):
+        unknown = sorted(set(given) - set(known))
+        if unknown:
+            raise ConfigError(f"unknown key {unknown[0]!r} in the {where}; `shoal train --help` lists the keys")
+    plain = {**values, "world": WorldConfig(**world)}
+    if "hidden_sizes" in plain:
+        plain["hidden_sizes"] = tuple(plain["hidden_sizes"])
+    return RunConfig(**plain)
+
+
+def config_hash(config: RunConfig) -> str:
+    """Twelve hex digits that tell configs apart; how long and where a run goes on does not count."""
+    values = to_dict(config)
+    for name in ("total_env_steps", "engine"):
+        values.pop(name)
+    text = json.dumps(values, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]

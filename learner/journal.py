@@ -1,0 +1,63 @@
+"""The run's metrics as a local file, whose length a checkpoint knows.
+
+MLflow is a mirror of it: rows are pushed once a checkpoint covers them, with the time they were made, so
+that a row that is pushed twice is stored once, and a resumed run neither repeats nor misses a step.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+
+class Row(NamedTuple):
+    """Metrics of one moment: env steps, wall time in milliseconds, values by name."""
+
+    env_steps: int
+    time_ms: int
+    metrics: dict[str, float]
+
+
+class Journal:
+    """Append-only rows in a file of JSON lines.
+
+    Args:
+      path: the file.
+      offset: bytes that count; what a crashed run wrote after them is cut off.
+
+    Raises:
+      ValueError: the file is shorter than `offset`.
+    """
+
+    def __init__(self, path: Path, offset: int) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._path = path
+        self._file = path.open("ab")
+        length = self._file.seek(0, os.SEEK_END)
+        if length < offset:
+            raise ValueError(f"{path} has {length} bytes, its checkpoint knows {offset}")
+        self._file.truncate(offset)
+        self._file.seek(offset)
+
+    def append(self, row: Row) -> None:
+        """Writes one row."""
+        self._file.write(json.dumps(row).encode() + b"\n")
+
+    def sync(self) -> int:
+        """Makes all rows durable; returns the file's length in bytes."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        return self._file.tell()
+
+    def rows(self, start: int = 0) -> list[Row]:
+        """The rows from byte `start` on."""
+        self._file.flush()
+        with self._path.open("rb") as file:
+            file.seek(start)
+            return [Row(*json.loads(line)) for line in file]
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()

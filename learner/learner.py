@@ -1,0 +1,124 @@
+"""The learner: online and target network, optimiser, and the update over a super-batch."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from actors.network import QNetwork, WeightsSnapshot, snapshot
+from learner.double_dqn import as_batch, huber_loss, targets
+
+
+class LearnerSettings(NamedTuple):
+    """What the learner needs to know of the run."""
+
+    observation_size: int
+    num_actions: int
+    hidden_sizes: tuple[int, ...]
+    double: bool
+    learning_rate: float
+    batch_size: int
+    target_update_interval: int
+    max_gradient_norm: float
+    seed: int
+
+
+class UpdateStats(NamedTuple):
+    """Means over the updates of one call."""
+
+    loss: float
+    q_mean: float
+    td_error: float
+
+
+class Learner:
+    """Owns the networks and changes them; every update is one gradient step of one minibatch.
+
+    Args:
+      settings: see LearnerSettings.
+    """
+
+    def __init__(self, settings: LearnerSettings) -> None:
+        self._settings = settings
+        with torch.random.fork_rng():
+            torch.manual_seed(settings.seed)
+            self.online = QNetwork(settings.observation_size, settings.hidden_sizes, settings.num_actions)
+        self.target = copy.deepcopy(self.online)
+        self.optimiser = torch.optim.Adam(self.online.parameters(), lr=settings.learning_rate, fused=True)
+        self.updates = 0
+
+    def update(self, rows: NDArray[Any]) -> UpdateStats:
+        """One update per `batch_size` rows of `rows`, a whole multiple of it."""
+        columns = _tensors(rows)
+        size = self._settings.batch_size
+        sums = torch.zeros(3)
+        starts = range(0, len(rows), size)
+        for start in starts:
+            sums += self._step(columns, slice(start, start + size))
+        loss, q_mean, td_error = (sums / len(starts)).tolist()
+        return UpdateStats(loss, q_mean, td_error)
+
+    def _step(self, columns: dict[str, Tensor], part: slice) -> Tensor:
+        batch = as_batch(columns, part)
+        target = targets(batch, self.online, self.target, self._settings.double)
+        q_tm1 = self.online(batch.s_tm1)
+        loss, td_error = huber_loss(q_tm1, batch.a_tm1, target)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.online.parameters(), self._settings.max_gradient_norm)
+        self.optimiser.step()
+        self.updates += 1
+        if self.updates % self._settings.target_update_interval == 0:
+            self.target.load_state_dict(self.online.state_dict())
+        return torch.stack([loss.detach(), q_tm1.detach().mean(), td_error.abs().mean()])
+
+    def weights(self, time_s: float) -> WeightsSnapshot:
+        """The online network, for publication."""
+        return snapshot(self.online, self.updates, time_s)
+
+    def get_state(self) -> dict[str, Tensor]:
+        """All tensors that a checkpoint needs, by name."""
+        state = {f"online.{name}": tensor for name, tensor in self.online.state_dict().items()}
+        state |= {f"target.{name}": tensor for name, tensor in self.target.state_dict().items()}
+        for i, parameter in enumerate(self.online.parameters()):
+            for name, tensor in self.optimiser.state.get(parameter, {}).items():
+                state[f"optimiser.{i}.{name}"] = tensor
+        state["updates"] = torch.tensor(self.updates)
+        return {name: tensor.detach().clone().contiguous() for name, tensor in state.items()}
+
+    def set_state(self, state: dict[str, Tensor]) -> None:
+        """Takes up what `get_state` gave.
+
+        Raises:
+          ValueError: the tensors are of a network of another shape.
+        """
+        try:
+            self.online.load_state_dict(_part(state, "online."))
+            self.target.load_state_dict(_part(state, "target."))
+        except RuntimeError as error:
+            raise ValueError(f"the saved networks have another shape: {str(error).splitlines()[-1].strip()}") from error
+        saved: dict[int, Any] = {}
+        for name, tensor in _part(state, "optimiser.").items():
+            index, key = name.split(".")
+            saved.setdefault(int(index), {})[key] = tensor
+        groups = self.optimiser.state_dict()["param_groups"]
+        self.optimiser.load_state_dict({"state": saved, "param_groups": groups})
+        self.updates = int(state["updates"])
+
+
+def _part(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
+
+
+def _tensors(rows: NDArray[Any]) -> dict[str, Tensor]:
+    """Columns of packed rows as tensors: observations and rewards float32, actions int64."""
+    columns = {name: torch.from_numpy(rows[name].astype(np.float32)) for name in ("reward", "discount")}
+    columns["action"] = torch.from_numpy(rows["action"].astype(np.int64))
+    for name in ("observation", "next_observation"):
+        columns[name] = torch.from_numpy(rows[name].astype(np.float32))
+    return columns

@@ -1,0 +1,259 @@
+"""The training loop: every hop from simulator to learned policy, in one process or over Ray actors.
+
+The loop holds references and small reports; transitions go from rollout worker to shard to learner.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from actors.calls import Ref
+from actors.evaluator import evaluate
+from actors.exploration import epsilon
+from actors.rollout import join_stats
+from actors.transitions import BlockReport, EpisodeStats
+from learner.checkpoint import Checkpoint, keep_newest, write_checkpoint
+from learner.cluster import Cluster
+from learner.config import RunConfig, config_hash
+from learner.journal import Journal, Row
+from learner.meters import Meters
+from learner.node import UpdateReport
+from learner.pacing import PacingState, make_pacer
+from learner.results import Evaluation, as_metrics, summarise
+
+EVAL_SEED = 1_000_000_000
+"""First seed of evaluations during training; training worlds draw theirs from other streams."""
+FINAL_EVAL_SEED = 2_000_000_000
+"""First seed of the evaluation at the end."""
+
+
+class Observer(Protocol):
+    """What the loop tells its surroundings."""
+
+    def row(self, row: Row) -> None:
+        """A row of metrics was written."""
+        ...
+
+    def checkpoint(self, folder: Path, journal_offset: int) -> None:
+        """A checkpoint is whole; rows up to the offset are covered by it."""
+        ...
+
+
+class Pending(NamedTuple):
+    """A call under way: its kind, and what is needed to take its result."""
+
+    kind: str
+    index: int
+    amount: int
+
+
+class TrainingLoop:
+    """One run from its start or a checkpoint to its end.
+
+    Args:
+      config: the run.
+      cluster: its parts.
+      journal: where metrics go.
+      checkpoints: folder of the run's checkpoints.
+      observer: is told of rows and checkpoints.
+      stop: asked once a round; True ends the run early, with a checkpoint.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        cluster: Cluster,
+        journal: Journal,
+        checkpoints: Path,
+        observer: Observer,
+        stop: Callable[[], bool],
+    ) -> None:
+        self._config = config
+        self._cluster = cluster
+        self._calls = cluster.calls
+        self._journal = journal
+        self._checkpoints = checkpoints
+        self._observer = observer
+        self._stop = stop
+        self._pacer = make_pacer(config, cluster.blocks_in_flight)
+        self._meters = Meters()
+        self._pending: dict[Ref, Pending] = {}
+        self._collects = [0] * len(cluster.workers)
+        self._blocks_in_flight = 0
+        self._weights: Ref = None
+        self._incarnation = 0
+        self.env_steps = 0
+        self.updates = 0
+        self._due = {"log": config.log_every_env_steps, "eval": config.eval_every_env_steps}
+        self._due["checkpoint"] = config.checkpoint_every_env_steps
+
+    def run(self) -> bool:
+        """Trains to `total_env_steps` or until stopped, and checkpoints the end.
+
+        Returns:
+          Whether the run is finished (else it was stopped).
+
+        Raises:
+          RuntimeError: nothing is under way and nothing may start.
+        """
+        if self._weights is None:
+            self._send_first_weights()
+        while self.env_steps < self._config.total_env_steps and not self._stop():
+            self._start_collects()  # act, step, store: the workers push to the shards
+            self._start_updates()  # sample, update, publish: when the pacer says so
+            self._take_results()
+            if self._is_due("eval", self._config.eval_every_env_steps):
+                self._start_evaluation()
+            if self._is_due("log", self._config.log_every_env_steps):
+                self._write_row(self._meters.row(self._replay_size(), self._pacer.ratio()))
+            if self._is_due("checkpoint", self._config.checkpoint_every_env_steps):
+                self.checkpoint()
+        self.checkpoint()
+        return self.env_steps >= self._config.total_env_steps
+
+    def _send_first_weights(self) -> None:
+        self._weights = self._get(self._cluster.learner, "weights")[0]
+        for ref in [self._calls.start(worker, "set_weights", self._weights) for worker in self._cluster.workers]:
+            self._calls.get(ref)
+
+    def _get(self, node: Any, method: str, *args: Any) -> Any:
+        return self._calls.get(self._calls.start(node, method, *args))
+
+    def _start_collects(self) -> None:
+        config = self._config
+        for _ in range(self._cluster.collects_in_flight):
+            for worker_id, worker in enumerate(self._cluster.workers):
+                if self._collects[worker_id] >= self._cluster.collects_in_flight:
+                    continue
+                if not self._pacer.may_collect(self._blocks_in_flight):
+                    self._pacer.waited(to_insert=True)
+                    return
+                rate = epsilon(config.epsilon_settings, self.env_steps, worker_id, config.workers)
+                self._add(self._calls.start(worker, "collect", rate), Pending("collect", worker_id, 0))
+                self._collects[worker_id] += 1
+                self._blocks_in_flight += 1
+
+    def _start_updates(self) -> None:
+        under_way = sum(pending.kind == "update" for pending in self._pending.values())
+        while under_way < self._cluster.updates_in_flight:
+            updates = self._pacer.updates_due()
+            if not updates:
+                return
+            self._pacer.sampling(updates)
+            self._add(self._calls.start(self._cluster.learner, "update", updates), Pending("update", 0, updates))
+            under_way += 1
+
+    def _start_evaluation(self) -> None:
+        seeds = list(range(EVAL_SEED, EVAL_SEED + self._config.eval_episodes))
+        ref = self._calls.run(evaluate, self._config.env, self._weights, seeds)
+        self._add(ref, Pending("eval", 0, self.env_steps))
+
+    def _add(self, ref: Ref, pending: Pending) -> None:
+        self._pending[ref] = pending
+
+    def _take_results(self) -> None:
+        if not self._pending:
+            raise RuntimeError("nothing is under way and pacing lets nothing start")
+        for ref in self._calls.wait(list(self._pending)):
+            pending = self._pending.pop(ref)
+            result = self._calls.get(ref)
+            if pending.kind == "collect":
+                self._collects[pending.index] -= 1
+                self._take_blocks(result)
+            elif pending.kind == "update":
+                self._take_updates(result, pending.amount)
+            else:
+                self._take_evaluation(result, pending.amount)
+
+    def _take_blocks(self, reports: list[BlockReport]) -> None:
+        for report in reports:
+            self._blocks_in_flight -= 1
+            self._pacer.inserted(report.stored)
+            self._meters.take_block(report)
+            self.env_steps += report.header.env_steps
+
+    def _take_updates(self, report: UpdateReport, updates: int) -> None:
+        self._meters.take_updates(report, updates)
+        self.updates = report.version
+        self._weights = report.weights[0]
+
+    def _take_evaluation(self, stats: EpisodeStats, env_steps: int) -> None:
+        metrics = {f"eval/{name}": value for name, value in as_metrics(summarise(stats)).items()}
+        self._write_row(metrics, env_steps)
+
+    def _write_row(self, metrics: dict[str, float], env_steps: int | None = None) -> None:
+        row = Row(self.env_steps if env_steps is None else env_steps, int(time.time() * 1000), metrics)
+        self._journal.append(row)
+        self._observer.row(row)
+
+    def _replay_size(self) -> int:
+        return min(self._pacer.state.inserted, self._config.replay_capacity)
+
+    def _is_due(self, what: str, every: int) -> bool:
+        """Whether `env_steps` has passed the next multiple of `every`; moves on to the one after."""
+        if self.env_steps < self._due[what]:
+            return False
+        self._due[what] = (self.env_steps // every + 1) * every
+        return True
+
+    def settle(self) -> None:
+        """Waits until nothing is under way anywhere."""
+        while self._pending:
+            self._take_results()
+        for worker in self._cluster.workers:
+            self._take_blocks(self._get(worker, "settle"))
+
+    def checkpoint(self) -> Path:
+        """Writes a checkpoint of the whole run at a moment when nothing is under way."""
+        self.settle()
+        offset = self._journal.sync()
+        folder = write_checkpoint(self._checkpoints, self.env_steps, lambda part: self._save(part, offset))
+        keep_newest(self._checkpoints, self._config.keep_checkpoints)
+        self._observer.checkpoint(folder, offset)
+        return folder
+
+    def _save(self, folder: Path, journal_offset: int) -> dict[str, Any]:
+        learner = self._get(self._cluster.learner, "save", folder)
+        workers = [
+            self._get(worker, "save", folder / f"worker-{i}.safetensors")
+            for i, worker in enumerate(self._cluster.workers)
+        ]
+        return {
+            "config_hash": config_hash(self._config),
+            "env_steps": self.env_steps,
+            "updates": self.updates,
+            "incarnation": self._incarnation,
+            "pacing": self._pacer.state._asdict(),
+            "meters": self._meters.get_state(),
+            "due": self._due,
+            "journal_offset": journal_offset,
+            "learner": learner,
+            "workers": workers,
+        }
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Takes up a checkpoint of this config; call before `run`.
+
+        Raises:
+          ValueError: its files do not fit this run.
+        """
+        folder, state = checkpoint
+        self._weights = self._get(self._cluster.learner, "load", folder, state["learner"])[0]
+        for i, worker in enumerate(self._cluster.workers):
+            self._get(worker, "load", folder / f"worker-{i}.safetensors", state["workers"][i])
+        self.env_steps, self.updates = state["env_steps"], state["updates"]
+        self._incarnation = state["incarnation"] + 1
+        self._pacer.state = PacingState(**state["pacing"])
+        self._meters.set_state(state["meters"])
+        self._due = dict(state["due"])
+
+    def final_evaluation(self) -> Evaluation:
+        """Evaluates the newest weights over `final_eval_episodes`, in parallel tasks."""
+        count, tasks = self._config.final_eval_episodes, self._cluster.eval_tasks
+        seeds = list(range(FINAL_EVAL_SEED, FINAL_EVAL_SEED + count))
+        parts = [seeds[i::tasks] for i in range(min(tasks, count))]
+        refs = [self._calls.run(evaluate, self._config.env, self._weights, part) for part in parts]
+        return summarise(join_stats([self._calls.get(ref) for ref in refs]))

@@ -1,0 +1,126 @@
+"""What runs in the learner's process: sample, update, publish; and the shards that are embedded there."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from actors.calls import Calls, Node, Ref
+from actors.nodes import ShardNode
+from actors.transitions import AddReply, SampleReply, TransitionBlock
+from learner.learner import Learner, LearnerSettings, UpdateStats
+
+
+class UpdateReport(NamedTuple):
+    """What a call of updates gives back: their means, the version reached, and a reference to the weights."""
+
+    stats: UpdateStats
+    version: int
+    weights: list[Ref]
+
+
+class LearnerNode:
+    """The learner with its replay shards, in this process or elsewhere.
+
+    Args:
+      settings: see LearnerSettings.
+      shards: nodes with `sample`, `publish`, `size`, `save`, `load`.
+      shard_calls: how to call the shards.
+      calls: how to share weights with rollout workers.
+    """
+
+    def __init__(self, settings: LearnerSettings, shards: list[Node], shard_calls: Calls, calls: Calls) -> None:
+        torch.set_num_threads(1)
+        self._settings = settings
+        self._learner = Learner(settings)
+        self._shards = shards
+        self._shard_calls = shard_calls
+        self._calls = calls
+        self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence((settings.seed, 1))))
+        self._sizes = np.zeros(len(shards), np.float64)
+        self._weights: Ref = None
+        self.publish()
+
+    def add(self, block: TransitionBlock) -> AddReply:
+        """Stores a block in an embedded shard, each in turn."""
+        shard: ShardNode = self._shards[block.header.sequence % len(self._shards)]
+        return shard.add(block)
+
+    def update(self, updates: int) -> UpdateReport:
+        """Samples a super-batch, makes `updates` updates of it, and publishes the weights."""
+        rows = self._sample(updates * self._settings.batch_size)
+        stats = self._learner.update(rows)
+        return UpdateReport(stats, self._learner.updates, self.publish())
+
+    def publish(self) -> list[Ref]:
+        """Shares the newest weights with all shards, whose replies carry them to the workers.
+
+        Returns:
+          A reference to the WeightsSnapshot, in a list so that it travels as a reference.
+        """
+        self._weights = self._calls.put(self._learner.weights(time.time()))
+        for shard in self._shards:
+            self._shard_calls.start(shard, "publish", self._learner.updates, [self._weights])
+        return [self._weights]
+
+    def _sample(self, count: int) -> NDArray[Any]:
+        """Draws rows from the shards in proportion to their sizes, in random order."""
+        if len(self._shards) == 1:
+            reply: SampleReply = self._shard_calls.get(self._shard_calls.start(self._shards[0], "sample", count))
+            return reply.rows
+        if not self._sizes.all():
+            self._sizes[:] = self._ask_all("size")
+        shares = self._rng.multinomial(count, self._sizes / self._sizes.sum())
+        refs = [
+            self._shard_calls.start(shard, "sample", int(share))
+            for shard, share in zip(self._shards, shares, strict=True)
+        ]
+        replies = [self._shard_calls.get(ref) for ref in refs]
+        self._sizes[:] = [reply.size for reply in replies]
+        return self._rng.permutation(np.concatenate([reply.rows for reply in replies]))
+
+    def _ask_all(self, method: str) -> list[Any]:
+        refs = [self._shard_calls.start(shard, method) for shard in self._shards]
+        return [self._shard_calls.get(ref) for ref in refs]
+
+    def save(self, folder: Path) -> dict[str, Any]:
+        """Writes learner and shards into `folder`; returns the rest of their state, for JSON."""
+        save_file(self._learner.get_state(), str(folder / "learner.safetensors"))
+        refs = [
+            self._shard_calls.start(shard, "save", folder / f"shard-{i}.zarr") for i, shard in enumerate(self._shards)
+        ]
+        shards = [self._shard_calls.get(ref) for ref in refs]
+        return {"shards": shards, "rng": self._rng.bit_generator.state, "sizes": self._sizes.tolist()}
+
+    def load(self, folder: Path, state: dict[str, Any]) -> list[Ref]:
+        """Takes up what `save` wrote and returned; publishes the weights (see `publish`).
+
+        Raises:
+          ValueError: the files are damaged or do not fit this run.
+        """
+        try:
+            self._learner.set_state(load_file(str(folder / "learner.safetensors")))
+        except (SafetensorError, OSError, KeyError) as error:
+            raise ValueError(f"{folder / 'learner.safetensors'} cannot be read ({error})") from error
+        if len(state["shards"]) != len(self._shards):
+            raise ValueError(f"the checkpoint has {len(state['shards'])} shards, this run {len(self._shards)}")
+        refs = [
+            self._shard_calls.start(shard, "load", folder / f"shard-{i}.zarr", shard_state)
+            for i, (shard, shard_state) in enumerate(zip(self._shards, state["shards"], strict=True))
+        ]
+        for ref in refs:
+            self._shard_calls.get(ref)
+        self._rng.bit_generator.state = state["rng"]
+        self._sizes[:] = state["sizes"]
+        return self.publish()
+
+    def weights(self) -> list[Ref]:
+        """A reference to the newest weights, in a list."""
+        return [self._weights]

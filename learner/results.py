@@ -1,0 +1,80 @@
+"""Rates, means and their confidence intervals from ended episodes."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats as scipy_stats
+
+from actors.transitions import NO_OUTCOME, EpisodeStats
+from sim_core.outcomes import ENDED, Outcome
+
+CONFIDENCE = 0.95
+
+
+class Estimate(NamedTuple):
+    """A value with its 95 % confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def rate(count: int, total: int) -> Estimate:
+    """Share of successes with its Wilson interval (Wilson 1927).
+
+    Raises:
+      ValueError: there are no trials.
+    """
+    interval = scipy_stats.binomtest(count, total).proportion_ci(CONFIDENCE, method="wilson")
+    return Estimate(count / total, float(interval.low), float(interval.high))
+
+
+def mean(values: np.ndarray) -> Estimate:
+    """Mean with its Student t interval; the interval is the value where it has no width."""
+    centre = float(np.mean(values))
+    if len(values) < 2:
+        return Estimate(centre, centre, centre)
+    half = scipy_stats.t.ppf(0.5 + CONFIDENCE / 2, len(values) - 1) * scipy_stats.sem(values)
+    return Estimate(centre, float(centre - half), float(centre + half))
+
+
+class Evaluation(NamedTuple):
+    """Summary of evaluated episodes; `rates` is empty where the environment names no outcomes."""
+
+    episodes: int
+    rates: dict[Outcome, Estimate]
+    episode_return: Estimate
+    episode_length: Estimate
+
+
+def summarise(stats: EpisodeStats) -> Evaluation:
+    """Summary of one entry per episode.
+
+    Raises:
+      ValueError: there are no episodes.
+    """
+    total = len(stats.outcome)
+    if total == 0:
+        raise ValueError("no episodes to summarise")
+    named = bool((stats.outcome != NO_OUTCOME).all())
+    rates = {kind: rate(int((stats.outcome == kind).sum()), total) for kind in ENDED} if named else {}
+    return Evaluation(total, rates, mean(stats.episode_return), mean(stats.length_steps))
+
+
+def outcome_label(outcome: Outcome) -> str:
+    """Metric name of an outcome's rate."""
+    return "success_rate" if outcome is Outcome.GOAL else f"{outcome.name.lower()}_rate"
+
+
+def as_metrics(evaluation: Evaluation) -> dict[str, float]:
+    """Flat metrics of an evaluation: every rate or, without outcomes, the return with its interval."""
+    metrics = {"return": evaluation.episode_return.value, "episode_length": evaluation.episode_length.value}
+    estimates = {outcome_label(kind): estimate for kind, estimate in evaluation.rates.items()}
+    if not estimates:
+        estimates = {"return": evaluation.episode_return}
+    for name, estimate in estimates.items():
+        metrics |= {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
+    return {name: value for name, value in metrics.items() if math.isfinite(value)}

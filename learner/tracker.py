@@ -1,0 +1,144 @@
+"""The MLflow side of a run: one client with an explicit run id, in the driver alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+import os
+import socket
+import subprocess
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from learner.config import RunConfig, config_hash
+from learner.journal import Row
+from sim_core.config import ConfigError
+
+os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
+
+import mlflow  # noqa: E402
+from mlflow.entities import Metric, Param, RunTag  # noqa: E402
+from mlflow.exceptions import MlflowException  # noqa: E402
+
+MAX_BATCH = 900
+"""Metrics of one request; MLflow takes at most 1,000."""
+OVERLAP_ROWS = 50
+"""Rows before a resumed checkpoint that are pushed again, in case the crash came before their push."""
+CONNECT_TIMEOUT_S = 5.0
+
+
+def flat_params(config: RunConfig) -> dict[str, Any]:
+    """The whole config as flat names; the world's fields and the run's have no name in common."""
+    values = dataclasses.asdict(config)
+    world = values.pop("world")
+    return values | world
+
+
+def check_reachable(uri: str) -> None:
+    """Raises ConfigError unless a server answers where `uri` is an address; local stores pass."""
+    parts = urlsplit(uri)
+    if parts.scheme not in ("http", "https"):
+        return
+    port = parts.port or (443 if parts.scheme == "https" else 80)
+    try:
+        socket.create_connection((parts.hostname or "", port), CONNECT_TIMEOUT_S).close()
+    except OSError as error:
+        raise ConfigError(
+            f"no MLflow server answers at {uri} ({error}); start one with `mlflow server`, or leave --tracking-uri out to "
+            "log to a local file"
+        ) from error
+
+
+class Tracker:
+    """One MLflow run.
+
+    Args:
+      uri: tracking URI.
+      experiment: experiment name; made if missing.
+      artifact_root: where a new experiment's artifacts go, None for the server's choice.
+
+    Raises:
+      ConfigError: the store cannot be opened.
+    """
+
+    def __init__(self, uri: str, experiment: str, artifact_root: str | None) -> None:
+        logging.getLogger("mlflow").setLevel(logging.ERROR)
+        logging.getLogger("alembic").setLevel(logging.ERROR)
+        check_reachable(uri)
+        self.uri = uri
+        self.run_id = ""
+        try:
+            self._client = mlflow.MlflowClient(uri)
+            found = self._client.get_experiment_by_name(experiment)
+            self._experiment_id = (
+                found.experiment_id if found else self._client.create_experiment(experiment, artifact_root)
+            )
+        except (MlflowException, OSError) as error:
+            first_line = str(error).splitlines()[0]
+            raise ConfigError(f"the MLflow store {uri} cannot be opened ({first_line}); name another --tracking-uri") from error
+
+    def start(self, config: RunConfig, name: str, method: str) -> None:
+        """Creates the run, with the whole config as params and what a user filters by as tags."""
+        tags = {
+            "method": method,
+            "robots": str(config.world.robots),
+            "groups": str(config.world.groups),
+            "seed": str(config.seed),
+            "engine": config.engine,
+            "config_hash": config_hash(config),
+            "mlflow.source.git.commit": _git_commit(),
+        }
+        run = self._client.create_run(self._experiment_id, run_name=name, tags=tags)
+        self.run_id = run.info.run_id
+        params = [Param(key, str(value)) for key, value in flat_params(config).items()]
+        self._client.log_batch(self.run_id, params=params)
+
+    def resume(self, run_id: str) -> None:
+        """Continues an existing run.
+
+        Raises:
+          ConfigError: the store does not know it.
+        """
+        try:
+            attempts = int(self._client.get_run(run_id).data.tags.get("attempts", "1"))
+            self._client.update_run(run_id, status="RUNNING")
+            self._client.log_batch(run_id, tags=[RunTag("attempts", str(attempts + 1))])
+        except MlflowException as error:
+            raise ConfigError(f"the MLflow store {self.uri} does not know run {run_id}; name the store it was logged to") from error
+        self.run_id = run_id
+
+    def push(self, rows: list[Row]) -> None:
+        """Mirrors journal rows; a row that is there already is stored once."""
+        metrics = [
+            Metric(key, value, row.time_ms, row.env_steps)
+            for row in rows
+            for key, value in row.metrics.items()
+            if math.isfinite(value)
+        ]
+        for start in range(0, len(metrics), MAX_BATCH):
+            self._client.log_batch(self.run_id, metrics=metrics[start : start + MAX_BATCH])
+
+    def final(self, metrics: dict[str, float], time_ms: int) -> None:
+        """Logs the run's results at step 0, where the UI draws them as bars."""
+        self.push([Row(0, time_ms, {f"final/{key}": value for key, value in metrics.items()})])
+
+    def artifact(self, path: Path) -> None:
+        """Uploads a file or a folder to the run's artifacts."""
+        if path.is_dir():
+            self._client.log_artifacts(self.run_id, str(path), path.name)
+        else:
+            self._client.log_artifact(self.run_id, str(path))
+
+    def end(self, status: str) -> None:
+        """Closes the run as FINISHED, KILLED or FAILED."""
+        self._client.set_terminated(self.run_id, status)
+
+
+def _git_commit() -> str:
+    """The commit of the checkout that this module lies in; `unknown` outside one."""
+    here = Path(__file__).parent
+    done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or "unknown"

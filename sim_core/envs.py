@@ -1,0 +1,205 @@
+"""Gymnasium environments over the worlds: one world as `Env`, a whole batch as `VectorEnv`.
+
+Registered as `shoal/SegregatedSwarm-v0`; keyword arguments are the fields of `WorldConfig`:
+
+    import gymnasium as gym
+    import sim_core
+    env = gym.make("shoal/SegregatedSwarm-v0", robots=10, groups=2)
+    envs = gym.make_vec("shoal/SegregatedSwarm-v0", num_envs=64, robots=10, groups=2)
+
+Observations, actions, rewards and outcomes are those of the chosen method. A success or failure of the
+task terminates an episode, the horizon truncates it. The vector environment restarts ended worlds in the
+same step (`AutoresetMode.SAME_STEP`): the returned observation is the new episode's first, the ended one's
+last stands in `infos["final_obs"]`, and `infos["final_info"]` holds `outcome`, `episode_length` and
+`episode_return`; the masks `_final_obs` and `_final_info` say where.
+"""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from sim_core.config import ConfigError, WorldConfig
+from sim_core.methods import make_method
+from sim_core.outcomes import Outcome
+from sim_core.render import draw_world
+from sim_core.worlds import WorldBatch, is_done, is_terminated
+
+RENDER_MODES = ["rgb_array"]
+
+
+def make_config(settings: dict[str, Any]) -> WorldConfig:
+    """WorldConfig from keyword arguments.
+
+    Raises:
+      ConfigError: a key is unknown or a value cannot work.
+    """
+    unknown = sorted(set(settings) - set(WorldConfig.__dataclass_fields__))
+    if unknown:
+        raise ConfigError(f"unknown setting {unknown[0]!r}; the settings are the fields of WorldConfig")
+    return WorldConfig(**settings)
+
+
+def observation_space(config: WorldConfig) -> gym.spaces.Box:
+    """The method's observations of one world."""
+    method = make_method(config)
+    limit = method.observation_limit
+    return gym.spaces.Box(-limit, limit, method.observation_shape, method.observation_dtype)
+
+
+def _check_render_mode(render_mode: str | None) -> None:
+    if render_mode is not None and render_mode not in RENDER_MODES:
+        raise ConfigError(f"render_mode must be one of {RENDER_MODES} or None, not {render_mode!r}")
+
+
+def _frames_per_s(config: WorldConfig) -> int:
+    return max(1, round(1 / config.time_step_s))
+
+
+def _draw(worlds: WorldBatch, world: int) -> NDArray[np.uint8]:
+    learner = int(worlds.state.learner[world])
+    return draw_world(worlds.positions()[world], worlds.goals()[world], learner, worlds.config)
+
+
+class SwarmEnv(gym.Env[NDArray[Any], np.int64]):
+    """One world; `info["outcome"]` is an `Outcome`, `Outcome.RUNNING` until the episode ends.
+
+    Args:
+      render_mode: None or `rgb_array`.
+      **settings: fields of WorldConfig.
+
+    Raises:
+      ConfigError: a setting is unknown or cannot work.
+    """
+
+    def __init__(self, render_mode: str | None = None, **settings: Any) -> None:
+        _check_render_mode(render_mode)
+        self.config = make_config(settings)
+        self.metadata = {"render_modes": RENDER_MODES, "render_fps": _frames_per_s(self.config)}
+        self.render_mode = render_mode
+        self.observation_space = observation_space(self.config)
+        self.action_space = cast("gym.Space[np.int64]", gym.spaces.Discrete(self.config.num_actions))
+        self.worlds = WorldBatch(self.config, 1)
+        self._seeded = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Starts an episode; with `seed`, from that seed's random stream."""
+        super().reset(seed=seed)
+        if seed is None and not self._seeded:
+            seed = int(self.np_random.integers(2**31))
+        if seed is not None:
+            self.worlds.seed([seed])
+            self._seeded = True
+        return self.worlds.reset()[0], {"outcome": int(Outcome.RUNNING)}
+
+    def step(self, action: np.int64) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
+        """One env step; see the module for what ends an episode.
+
+        Raises:
+          ValueError: the action is none of the action space.
+        """
+        if not self.action_space.contains(np.int64(action)):
+            raise ValueError(f"action must be in 0..{self.config.num_actions - 1}, not {action!r}")
+        result = self.worlds.step(np.array([action], np.int64))
+        outcome = int(result.outcome[0])
+        info: dict[str, Any] = {"outcome": outcome}
+        if outcome != Outcome.RUNNING:
+            info["episode_length"] = int(result.steps[0])
+            info["episode_return"] = float(result.episode_return[0])
+        terminated = bool(is_terminated(result.outcome)[0])
+        truncated = outcome == Outcome.TIMEOUT
+        return result.observation[0], float(result.reward[0]), terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The world as `[height, width, 3]` uint8 in mode `rgb_array`, else None."""
+        return _draw(self.worlds, 0) if self.render_mode == "rgb_array" else None
+
+
+class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArray[Any]]):
+    """A batch of worlds stepped by one call; restarts in the same step (see the module).
+
+    Args:
+      num_envs: number of worlds.
+      render_mode: None or `rgb_array`.
+      **settings: fields of WorldConfig.
+
+    Raises:
+      ConfigError: a setting is unknown or cannot work.
+    """
+
+    def __init__(self, num_envs: int = 1, render_mode: str | None = None, **settings: Any) -> None:
+        _check_render_mode(render_mode)
+        self.config = make_config(settings)
+        self.metadata = {
+            "autoreset_mode": AutoresetMode.SAME_STEP,
+            "render_modes": RENDER_MODES,
+            "render_fps": _frames_per_s(self.config),
+        }
+        self.render_mode = render_mode
+        self.num_envs = num_envs
+        self.single_observation_space = observation_space(self.config)
+        self.single_action_space = gym.spaces.Discrete(self.config.num_actions)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.worlds = WorldBatch(self.config, num_envs)
+        self._seeded = False
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Starts an episode in every world; world i takes `seed + i`, or `seed[i]` of a list."""
+        if seed is None and not self._seeded:
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        if isinstance(seed, int):
+            seed = [seed + i for i in range(self.num_envs)]
+        if seed is not None:
+            given = [value for value in seed if value is not None]
+            if len(given) != self.num_envs:
+                raise ValueError(f"seed must name {self.num_envs} whole numbers, one a world, not {seed!r}")
+            self.worlds.seed(given)
+            self._seeded = True
+        return self.worlds.reset(), {}
+
+    def step(
+        self, actions: NDArray[np.int64]
+    ) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """One env step of every world; `actions` `[num_envs]`.
+
+        Raises:
+          ValueError: an action is none of the action space.
+        """
+        actions = np.asarray(actions, np.int64)
+        if actions.shape != (self.num_envs,) or actions.min() < 0 or actions.max() >= self.config.num_actions:
+            raise ValueError(f"actions must be {self.num_envs} whole numbers in 0..{self.config.num_actions - 1}")
+        result = self.worlds.step(actions)
+        done, terminated = is_done(result.outcome), is_terminated(result.outcome)
+        observation, infos = result.observation, dict[str, Any]()
+        if done.any():
+            infos = {
+                "final_obs": observation,
+                "_final_obs": done,
+                "final_info": {
+                    "outcome": result.outcome,
+                    "_outcome": done,
+                    "episode_length": result.steps,
+                    "_episode_length": done,
+                    "episode_return": result.episode_return,
+                    "_episode_return": done,
+                },
+                "_final_info": done,
+            }
+            observation = self.worlds.reset(done)
+        return observation, result.reward.astype(np.float64), terminated, done & ~terminated, infos
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+        """One image `[height, width, 3]` uint8 a world in mode `rgb_array`, else None."""
+        if self.render_mode != "rgb_array":
+            return None
+        return tuple(_draw(self.worlds, world) for world in range(self.num_envs))

@@ -1,0 +1,216 @@
+"""ORCA's linear programs against enumeration of all candidate points and scipy's SLSQP, in float64.
+
+A half-plane is (point, unit direction d); its violation at v is det(d, point - v) = offset - n . v with
+the inward normal n = (-d_y, d_x).
+"""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy import optimize
+
+from sim_core.orca import linear_program_2, linear_program_3, orca_params
+
+PARAMS = orca_params(0.2, 2.0, 0.05, 1.0, np.float64)
+LIMIT = 1.3
+ATOL = 1e-6
+
+
+def random_lines(rng, count, spread):
+    """Half-planes `[count, 4]` with points scattered by `spread`; a few directions (anti-)parallel to others."""
+    angle = rng.uniform(-np.pi, np.pi, count)
+    if count > 2 and rng.random() < 0.3:
+        angle[1] = angle[0] + np.pi * rng.integers(2)
+    return np.column_stack([rng.normal(0, spread, (count, 2)), np.cos(angle), np.sin(angle)])
+
+
+def normals_and_offsets(lines):
+    """Inward unit normals `[count, 2]` and offsets `[count]`: violation = offset - normal . v."""
+    normal = np.column_stack([-lines[:, 3], lines[:, 2]])
+    return normal, np.einsum("ij,ij->i", normal, lines[:, :2])
+
+
+def violation(lines, v):
+    """Largest violation `[...]` at the points v `[..., 2]`."""
+    normal, offset = normals_and_offsets(lines)
+    return (offset - np.asarray(v) @ normal.T).max(axis=-1)
+
+
+def on_circle(normal, offset, limit):
+    """The points of the circle where normal . v = offset (any length of normal)."""
+    length = np.linalg.norm(normal)
+    if length < 1e-12 or abs(offset) > limit * length:
+        return []
+    foot, along = normal * offset / length**2, np.array([-normal[1], normal[0]]) / length
+    half = np.sqrt(max(limit**2 - foot @ foot, 0.0))
+    return [foot + half * along, foot - half * along]
+
+
+def nearest_permitted(lines, limit, opt):
+    """The permitted velocity nearest to `opt`, or None: best of all points where the optimum can lie."""
+    normal, offset = normals_and_offsets(lines)
+    length = np.linalg.norm(opt)
+    points = [opt if length <= limit else opt / length * limit]
+    for i in range(len(lines)):
+        points.append(opt + (offset[i] - normal[i] @ opt) * normal[i])
+        points += on_circle(normal[i], offset[i], limit)
+    for i, j in itertools.combinations(range(len(lines)), 2):
+        pair = normal[[i, j]]
+        if abs(np.linalg.det(pair)) > 1e-12:
+            points.append(np.linalg.solve(pair, offset[[i, j]]))
+    points = np.array(points)
+    fine = (violation(lines, points) < 1e-9) & (np.linalg.norm(points, axis=1) < limit + 1e-9)
+    if not fine.any():
+        return None
+    return min(points[fine], key=lambda v: np.linalg.norm(v - opt))
+
+
+def least_violation(lines, limit):
+    """Smallest possible largest violation in the disc: best of all points where the optimum can lie."""
+    normal, offset = normals_and_offsets(lines)
+    points = list(limit * normal)
+    for i, j in itertools.combinations(range(len(lines)), 2):
+        points += on_circle(normal[i] - normal[j], offset[i] - offset[j], limit)
+        points.append(0.5 * (lines[i, :2] + lines[j, :2]))  # matters for antiparallel pairs
+    for triple in itertools.combinations(range(len(lines)), 3):
+        system = np.column_stack([normal[list(triple)], np.ones(3)])
+        if abs(np.linalg.det(system)) > 1e-12:
+            points.append(np.linalg.solve(system, offset[list(triple)])[:2])
+    points = np.array(points)
+    inside = np.linalg.norm(points, axis=1) <= limit + 1e-9
+    return violation(lines, points[inside]).min()
+
+
+def solve(lines, opt, direction_opt=False):
+    """The second program's (failed row, velocity)."""
+    failed, x, y = linear_program_2(lines, len(lines), LIMIT, opt[0], opt[1], direction_opt, PARAMS)
+    return failed, np.array([x, y])
+
+
+def relax(lines, failed, v):
+    """The third program's velocity."""
+    projected = np.zeros_like(lines)
+    return np.array(linear_program_3(lines, len(lines), failed, LIMIT, v[0], v[1], projected, PARAMS))
+
+
+def test_second_program_finds_the_nearest_permitted_velocity():
+    rng = np.random.default_rng(0)
+    feasible, borderline = 0, 0
+    for _ in range(600):
+        lines = random_lines(rng, int(rng.integers(1, 11)), rng.choice([0.2, 0.6, 1.5]))
+        opt = rng.normal(0, 1.0, 2)
+        margin = -least_violation(lines, LIMIT)
+        if abs(margin) < 1e-6:
+            borderline += 1
+            continue
+        failed, v = solve(lines, opt)
+        assert (failed == len(lines)) == (margin > 0)
+        if margin > 0:
+            feasible += 1
+            np.testing.assert_allclose(v, nearest_permitted(lines, LIMIT, opt), atol=ATOL)
+    assert 100 < feasible < 500 and borderline < 10
+
+
+def test_a_failed_row_is_the_first_that_empties_the_set():
+    rng = np.random.default_rng(1)
+    failures = 0
+    for _ in range(300):
+        lines, opt = random_lines(rng, 8, 0.8), rng.normal(0, 1.0, 2)
+        failed, v = solve(lines, opt)
+        if failed == len(lines) or abs(least_violation(lines[: failed + 1], LIMIT)) < 1e-6:
+            continue
+        failures += 1
+        assert least_violation(lines[: failed + 1], LIMIT) > 0
+        if failed > 0:
+            np.testing.assert_allclose(v, nearest_permitted(lines[:failed], LIMIT, opt), atol=ATOL)
+    assert failures > 100
+
+
+def test_direction_goal_finds_the_farthest_permitted_velocity():
+    rng = np.random.default_rng(2)
+    feasible = 0
+    for _ in range(300):
+        lines, angle = random_lines(rng, int(rng.integers(1, 8)), 0.4), rng.uniform(-np.pi, np.pi)
+        direction = np.array([np.cos(angle), np.sin(angle)])
+        failed, v = solve(lines, direction, direction_opt=True)
+        if failed < len(lines):
+            continue
+        feasible += 1
+        far = nearest_permitted(lines, LIMIT, 1e4 * direction)  # nearest to a point far out
+        assert direction @ v == pytest.approx(direction @ far, abs=1e-3)
+        assert violation(lines, v) < ATOL and np.linalg.norm(v) < LIMIT + ATOL
+    assert feasible > 100
+
+
+def test_third_program_violates_the_worst_half_plane_least():
+    rng = np.random.default_rng(3)
+    infeasible = 0
+    for _ in range(600):
+        lines = random_lines(rng, int(rng.integers(2, 11)), rng.choice([0.6, 1.5, 3.0]))
+        failed, v = solve(lines, rng.normal(0, 1.0, 2))
+        if failed == len(lines):
+            continue
+        infeasible += 1
+        v = relax(lines, failed, v)
+        assert np.linalg.norm(v) < LIMIT + ATOL
+        assert violation(lines, v) == pytest.approx(least_violation(lines, LIMIT), abs=1e-5)
+    assert infeasible > 200
+
+
+def test_both_programs_agree_with_slsqp():
+    rng = np.random.default_rng(4)
+    counts = [0, 0]
+    disc = {"type": "ineq", "fun": lambda z: LIMIT**2 - z[0] ** 2 - z[1] ** 2}
+    for _ in range(120):
+        lines, opt = random_lines(rng, 4, 0.7), rng.normal(0, 1.0, 2)
+        normal, offset = normals_and_offsets(lines)
+        failed, v = solve(lines, opt)
+        if failed == len(lines):
+            planes = {"type": "ineq", "fun": lambda z, n=normal, o=offset: n @ z - o}
+            found = optimize.minimize(
+                lambda z, opt=opt: np.sum((z - opt) ** 2), v * 0.9, method="SLSQP", constraints=[disc, planes]
+            )
+            error = np.abs(v - found.x).max()
+        else:
+            v = relax(lines, failed, v)
+            planes = {"type": "ineq", "fun": lambda z, n=normal, o=offset: n @ z[:2] - o + z[2]}
+            found = optimize.minimize(lambda z: z[2], [0, 0, 5], method="SLSQP", constraints=[disc, planes])
+            error = abs(violation(lines, v) - found.fun)
+        if found.success:
+            counts[failed < len(lines)] += 1
+            assert error < 1e-3
+    assert min(counts) > 15
+
+
+def test_antiparallel_half_planes_that_exclude_each_other_meet_halfway():
+    lines = np.array([[0.0, -0.6, -1.0, 0.0], [0.0, 0.2, 1.0, 0.0]])  # y <= -0.6 and y >= 0.2
+    failed, v = solve(lines, np.array([0.3, 0.9]))
+    assert failed == 1
+    v = relax(lines, failed, v)
+    assert v[1] == pytest.approx(-0.2) and np.isfinite(v).all()
+
+
+@pytest.mark.parametrize("copies", [2, 5])
+def test_equal_half_planes_count_once(copies):
+    lines = np.tile([[0.0, 0.5, 1.0, 0.0]], (copies, 1))  # y >= 0.5
+    failed, v = solve(lines, np.array([0.1, -1.0]))
+    assert failed == copies
+    np.testing.assert_allclose(v, [0.1, 0.5])
+
+
+def test_a_half_plane_outside_the_speed_disc_is_violated_least():
+    lines = np.array([[0.0, 5.0, 1.0, 0.0]])  # y >= 5
+    failed, v = solve(lines, np.array([0.5, 0.0]))
+    assert failed == 0
+    np.testing.assert_allclose(relax(lines, failed, v), [0.0, LIMIT], atol=1e-9)
+
+
+@pytest.mark.parametrize("turn", [1e-7, 1e-6, 1e-4])
+def test_nearly_parallel_half_planes_stay_finite(turn):
+    lines = np.array([[0.0, 0.9, 1.0, 0.0], [0.0, -0.9, -np.cos(turn), np.sin(turn)], [0.0, 0.91, 1.0, turn]])
+    failed, v = solve(lines, np.array([0.0, 0.0]))
+    assert failed < 3
+    v = relax(lines, failed, v)
+    assert np.isfinite(v).all() and np.linalg.norm(v) < LIMIT + ATOL
+    assert violation(lines, v) == pytest.approx(least_violation(lines, LIMIT), abs=2e-2)
