@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -77,6 +78,28 @@ def record_episode(spec: EnvSpec, weights: WeightsSnapshot, seed: int) -> Episod
         outcome=outcome,
         seed=seed,
     )
+
+
+def record_frames(spec: EnvSpec, weights: WeightsSnapshot, seed: int) -> tuple[list[NDArray[np.uint8]], float]:
+    """Plays one greedy episode of any Gymnasium environment and keeps its images.
+
+    Returns:
+      (images `[height, width, 3]`, images per second); no images where the environment has no rgb_array mode.
+    """
+    policy = Policy(weights)
+    try:
+        env = gym.make(spec.env_id, render_mode="rgb_array")
+    except (TypeError, gym.error.Error):
+        return [], 0.0
+    frames_per_s = float(env.metadata.get("render_fps", 30))
+    observation, _ = env.reset(seed=seed)
+    frames, ended = list[NDArray[np.uint8]](), False
+    while not ended:
+        frames.append(np.asarray(env.render(), np.uint8))
+        observation, _, terminated, truncated, _ = env.step(policy.greedy(observation[None])[0])
+        ended = terminated or truncated
+    env.close()
+    return frames, frames_per_s
 
 
 def _state_of(worlds: WorldBatch) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:

@@ -34,9 +34,7 @@ def epsilon(exploration: Exploration, env_steps: int, worker_id: int, workers: i
     return exploration.start + done * (exploration.end - exploration.start)
 
 
-def explore(
-    greedy: NDArray[np.int64], rate: float, num_actions: int, rng: np.random.Generator
-) -> NDArray[np.int64]:
+def explore(greedy: NDArray[np.int64], rate: float, num_actions: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Replaces each of `greedy` `[batch]` by a uniform action with probability `rate`."""
     random = rng.integers(num_actions, size=len(greedy))
     return np.where(rng.random(len(greedy)) < rate, random, greedy)

@@ -75,9 +75,7 @@ def env_shape(spec: EnvSpec) -> EnvShape:
         env.close()
 
 
-def final_observations(
-    observation: NDArray[Any], done: NDArray[np.bool_], infos: dict[str, Any]
-) -> NDArray[Any]:
+def final_observations(observation: NDArray[Any], done: NDArray[np.bool_], infos: dict[str, Any]) -> NDArray[Any]:
     """The states that a step reached: `observation`, with the ended episodes' last ones put in."""
     if not done.any():
         return observation

@@ -83,7 +83,9 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         found = manifest["format"]
         sums: dict[str, str] = manifest["sha256"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f"checkpoint {folder} has no readable manifest; use an older one or train anew") from error
+        raise CheckpointError(
+            f"checkpoint {folder} has no readable manifest; use an older one or train anew"
+        ) from error
     if found != FORMAT:
         raise CheckpointError(f"checkpoint {folder} is in format {found!r}, this version reads {FORMAT}")
     for name, expected in sums.items():

@@ -23,7 +23,7 @@ class Batch(NamedTuple):
 
 
 def double_q_target(q_t_online: Tensor, q_t_target: Tensor, r_t: Tensor, discount_t: Tensor) -> Tensor:
-    """r + discount * Q_target(s', argmax_a Q_online(s', a)), `[batch]` (Algorithm 2).
+    """R + discount * Q_target(s', argmax_a Q_online(s', a)), `[batch]` (Algorithm 2).
 
     Args:
       q_t_online, q_t_target: action values of the next state `[batch, actions]` by either network.
@@ -34,7 +34,7 @@ def double_q_target(q_t_online: Tensor, q_t_target: Tensor, r_t: Tensor, discoun
 
 
 def q_target(q_t_target: Tensor, r_t: Tensor, discount_t: Tensor) -> Tensor:
-    """r + discount * max_a Q_target(s', a), `[batch]` (Algorithm 1)."""
+    """R + discount * max_a Q_target(s', a), `[batch]` (Algorithm 1)."""
     return r_t + discount_t * q_t_target.amax(dim=1)
 
 

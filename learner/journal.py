@@ -61,3 +61,29 @@ class Journal:
     def close(self) -> None:
         """Closes the file."""
         self._file.close()
+
+
+class PushedMark:
+    """Remembers over restarts up to which byte the journal was pushed; a crash before the note only pushes twice.
+
+    Args:
+      path: the file that holds the number.
+      limit: length of the journal now; a mark beyond it does not count.
+    """
+
+    def __init__(self, path: Path, limit: int) -> None:
+        self._path = path
+        self.write(min(limit, self.read()))
+
+    def read(self) -> int:
+        """The byte; 0 where nothing is noted."""
+        try:
+            return int(self._path.read_text())
+        except (OSError, ValueError):
+            return 0
+
+    def write(self, offset: int) -> None:
+        """Notes a byte."""
+        part = self._path.with_suffix(".part")
+        part.write_text(str(offset))
+        part.replace(self._path)

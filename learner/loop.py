@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 from actors.calls import Ref
 from actors.evaluator import evaluate
 from actors.exploration import epsilon
+from actors.network import WeightsSnapshot
 from actors.rollout import join_stats
 from actors.transitions import BlockReport, EpisodeStats
 from learner.checkpoint import Checkpoint, keep_newest, write_checkpoint
@@ -101,6 +102,7 @@ class TrainingLoop:
         """
         if self._weights is None:
             self._send_first_weights()
+        self._meters.start_clock()
         while self.env_steps < self._config.total_env_steps and not self._stop():
             self._start_collects()  # act, step, store: the workers push to the shards
             self._start_updates()  # sample, update, publish: when the pacer says so
@@ -257,3 +259,8 @@ class TrainingLoop:
         parts = [seeds[i::tasks] for i in range(min(tasks, count))]
         refs = [self._calls.run(evaluate, self._config.env, self._weights, part) for part in parts]
         return summarise(join_stats([self._calls.get(ref) for ref in refs]))
+
+    def newest_weights(self) -> WeightsSnapshot:
+        """The weights that `final_evaluation` plays."""
+        weights: WeightsSnapshot = self._calls.get(self._weights)
+        return weights

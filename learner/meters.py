@@ -21,6 +21,10 @@ class Meters:
         self._start_s = time.perf_counter()
         self._measured = {"env_steps": 0.0, "updates": 0.0}
 
+    def start_clock(self) -> None:
+        """Speeds of the next row count from now."""
+        self._start_s = time.perf_counter()
+
     def _add(self, **values: float) -> None:
         for name, value in values.items():
             self._sums[name] = self._sums.get(name, 0.0) + value

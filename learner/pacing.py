@@ -56,7 +56,9 @@ class Pacer:
         self._updates_per_call = updates_per_call
         self._block_rows = block_rows
         self._lowest = min_replay * samples_per_insert
-        self._highest = self._lowest + 2 * batch_size * updates_per_call + blocks_in_flight * block_rows * samples_per_insert
+        self._highest = (
+            self._lowest + 2 * batch_size * updates_per_call + blocks_in_flight * block_rows * samples_per_insert
+        )
         self.state = PacingState(0, 0, 0, 0)
 
     def may_collect(self, blocks_in_flight: int) -> bool:

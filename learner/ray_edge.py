@@ -8,14 +8,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import ray
 from ray.actor import ActorHandle
 
 from actors.calls import LocalCalls, Node, Ref
+from actors.evaluator import evaluate
+from actors.network import WeightsSnapshot
 from actors.nodes import RolloutNode, ShardNode
-from actors.vector_env import env_shape
+from actors.rollout import join_stats
+from actors.transitions import EpisodeStats
+from actors.vector_env import EnvSpec, env_shape
 from learner.cluster import Cluster, learner_settings, rollout_settings, shard_settings
 from learner.config import RunConfig
 from learner.node import LearnerNode
@@ -32,6 +37,11 @@ DEADLINE_S = 300.0
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
+@lru_cache
+def _task(function: Callable[..., Any]) -> Any:
+    return ray.remote(num_cpus=0)(function)
+
+
 class RayCalls:
     """Calls of Ray actors; implements `actors.calls.Calls`."""
 
@@ -41,7 +51,7 @@ class RayCalls:
 
     def run(self, function: Callable[..., Any], *args: Any) -> Ref:
         """Starts a function as a Ray task; it takes no CPU slot, so that it never waits for the run's own actors."""
-        return ray.remote(num_cpus=0)(function).remote(*args)
+        return _task(function).remote(*args)
 
     def wait(self, refs: list[Ref]) -> list[Ref]:
         """Blocks until one of `refs` is there; returns all that are, in the given order.
@@ -86,34 +96,50 @@ def cpus_needed(config: RunConfig) -> int:
     return config.workers + shards + 1
 
 
-def connect(config: RunConfig, address: str | None) -> None:
-    """Joins the cluster at `address`, or starts Ray on this machine.
+def connect(cpus: int, address: str | None) -> None:
+    """Joins the cluster at `address`, or starts Ray on this machine with room for `cpus` CPU slots.
 
     Raises:
       ConfigError: the cluster cannot be reached or has too few CPUs.
     """
     os.environ.setdefault("RAY_AUTH_MODE", "disabled" if address is None else "token")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    needed = cpus_needed(config)
-    options: dict[str, Any] = {"include_dashboard": False, "num_cpus": max(needed, os.cpu_count() or 1)}
-    if address is not None:
-        options = {"address": address}
+    options: dict[str, Any] = {"address": address}
+    if address is None:
+        options = {"address": "local", "include_dashboard": False, "num_cpus": max(cpus, os.cpu_count() or 1)}
     try:
-        ray.init(log_to_driver=True, logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
+        ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
     except ConnectionError as error:
         raise ConfigError(f"no Ray cluster answers at {address!r}; start one with `ray start --head`") from error
     have = int(ray.cluster_resources().get("CPU", 0))
-    if have < needed:
+    if have < cpus:
         ray.shutdown()
         raise ConfigError(
-            f"the run needs {needed} CPUs (workers {config.workers}, learner 1, shard actors the rest), the cluster has "
-            f"{have}: lower workers or replay_shards, or add nodes"
+            f"the run needs {cpus} CPUs (one a rollout worker, shard actor and learner), the cluster has {have}: "
+            "lower workers or replay_shards, or add nodes"
         )
+
+
+def evaluate_in_tasks(spec: EnvSpec, weights: WeightsSnapshot, seeds: list[int], address: str | None) -> EpisodeStats:
+    """Plays one greedy episode a seed in Ray tasks on all CPUs (see `connect` for errors).
+
+    Returns:
+      One entry a seed; their order is not that of the seeds.
+    """
+    connect(1, address)
+    try:
+        calls = RayCalls()
+        tasks = max(1, int(ray.cluster_resources().get("CPU", 1)))
+        shared = calls.put(weights)
+        refs = [calls.run(evaluate, spec, shared, seeds[i::tasks]) for i in range(min(tasks, len(seeds)))]
+        return join_stats([calls.get(ref) for ref in refs])
+    finally:
+        ray.shutdown()
 
 
 def ray_cluster(config: RunConfig, incarnation: int, address: str | None) -> Cluster:
     """Places the run's parts as Ray actors (see `connect` for errors)."""
-    connect(config, address)
+    connect(cpus_needed(config), address)
     calls = RayCalls()
     shape = env_shape(config.env)
     shards: list[Node] = []

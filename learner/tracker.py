@@ -12,6 +12,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import numpy as np
+import torch
+
+from actors.network import QNetwork, WeightsSnapshot, load_snapshot
+from actors.vector_env import EnvShape
 from learner.config import RunConfig, config_hash
 from learner.journal import Row
 from sim_core.config import ConfigError
@@ -20,13 +25,13 @@ os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
 
 import mlflow  # noqa: E402
+import mlflow.pytorch  # noqa: E402
 from mlflow.entities import Metric, Param, RunTag  # noqa: E402
 from mlflow.exceptions import MlflowException  # noqa: E402
+from mlflow.models import infer_signature  # noqa: E402
 
 MAX_BATCH = 900
 """Metrics of one request; MLflow takes at most 1,000."""
-OVERLAP_ROWS = 50
-"""Rows before a resumed checkpoint that are pushed again, in case the crash came before their push."""
 CONNECT_TIMEOUT_S = 5.0
 
 
@@ -78,7 +83,9 @@ class Tracker:
             )
         except (MlflowException, OSError) as error:
             first_line = str(error).splitlines()[0]
-            raise ConfigError(f"the MLflow store {uri} cannot be opened ({first_line}); name another --tracking-uri") from error
+            raise ConfigError(
+                f"the MLflow store {uri} cannot be opened ({first_line}); name another --tracking-uri"
+            ) from error
 
     def start(self, config: RunConfig, name: str, method: str) -> None:
         """Creates the run, with the whole config as params and what a user filters by as tags."""
@@ -107,7 +114,9 @@ class Tracker:
             self._client.update_run(run_id, status="RUNNING")
             self._client.log_batch(run_id, tags=[RunTag("attempts", str(attempts + 1))])
         except MlflowException as error:
-            raise ConfigError(f"the MLflow store {self.uri} does not know run {run_id}; name the store it was logged to") from error
+            raise ConfigError(
+                f"the MLflow store {self.uri} does not know run {run_id}; name the store it was logged to"
+            ) from error
         self.run_id = run_id
 
     def push(self, rows: list[Row]) -> None:
@@ -124,6 +133,24 @@ class Tracker:
     def final(self, metrics: dict[str, float], time_ms: int) -> None:
         """Logs the run's results at step 0, where the UI draws them as bars."""
         self.push([Row(0, time_ms, {f"final/{key}": value for key, value in metrics.items()})])
+
+    def log_policy(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> None:
+        """Logs the greedy policy's Q-network as a model with its signature: observations to action values."""
+        network = QNetwork(shape.observation_size, config.hidden_sizes, shape.num_actions)
+        load_snapshot(network, weights)
+        example = np.zeros((2, *shape.observation_space.shape), np.float32)
+        with torch.no_grad():
+            values = network(torch.from_numpy(example)).numpy()
+        mlflow.set_tracking_uri(self.uri)
+        with mlflow.start_run(run_id=self.run_id):
+            mlflow.pytorch.log_model(
+                network.eval(),
+                name="policy",
+                signature=infer_signature(example, values),
+                input_example=example,
+                serialization_format="pt2",
+                pip_requirements=[f"torch=={torch.__version__.split('+')[0]}", f"numpy=={np.__version__}"],
+            )
 
     def artifact(self, path: Path) -> None:
         """Uploads a file or a folder to the run's artifacts."""

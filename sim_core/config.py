@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 
-class ConfigError(ValueError):
+class ConfigError(Exception):
     """A setting that cannot work; the message says what, where and how to mend it."""
 
 
@@ -84,11 +84,11 @@ class WorldConfig:
     separation_noise: float = 0.2
     """`published`: random gain of the separation term against mirror deadlock."""
     sight_range_m: float = 0.789
-    """`published`: range at which a robot of another group is seen."""
+    """Range at which a robot of another group is seen (both rule sets)."""
     sight_angle_deg: float = 90.0
-    """`published`: ... and its largest angle from the goal direction."""
+    """... and its largest angle from the goal direction (both rule sets)."""
     view_range_m: float = 2.63
-    """`published`: a neighbour this near can block the view of the goal."""
+    """`published`: a neighbour (so within neighbour_range_m too) this near can block the view of the goal."""
     view_angle_deg: float = 20.0
     """`published`: ... when within this angle of the goal direction."""
     cohesion_weight: float = 0.3
@@ -122,7 +122,7 @@ class WorldConfig:
 
     @property
     def setup(self) -> str:
-        """The setup as the dissertation writes it, such as `10r x 2g`."""
+        """The setup as the dissertation writes it, such as `10r×2g`."""
         return f"{self.robots}r×{self.groups}g"
 
 
@@ -145,8 +145,12 @@ def _check_types(config: WorldConfig) -> None:
             ok = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
             require(ok, f"{name} must be a finite number, not {value!r}")
     require(config.method == "sensor", f"method must be one of: sensor; not {config.method!r}")
-    require(config.flocking in ("published", "uniform"), f"flocking must be published or uniform, not {config.flocking!r}")
-    require(config.reward_clock in ("step", "horizon"), f"reward_clock must be step or horizon, not {config.reward_clock!r}")
+    require(
+        config.flocking in ("published", "uniform"), f"flocking must be published or uniform, not {config.flocking!r}"
+    )
+    require(
+        config.reward_clock in ("step", "horizon"), f"reward_clock must be step or horizon, not {config.reward_clock!r}"
+    )
 
 
 def _check_counts(config: WorldConfig) -> None:
@@ -212,9 +216,10 @@ def _check_start_room(config: WorldConfig) -> None:
         f"must be at least 2 × robot_radius_m ({2 * config.robot_radius_m:.3g} m)",
     )
     require(
-        config.start_spacing_m + 2 * config.start_jitter_m < config.outer_radius_m,
-        f"the learning robot would start lost: start_spacing_m ({config.start_spacing_m}) plus twice start_jitter_m "
-        f"must be below outer_radius_m (R2 = {config.outer_radius_m})",
+        math.hypot(config.start_spacing_m + 2 * config.start_jitter_m, 2 * config.start_jitter_m)
+        < config.outer_radius_m,
+        f"the learning robot could start lost: its next robot, start_spacing_m ({config.start_spacing_m}) away and each "
+        f"shifted by start_jitter_m, must be nearer than outer_radius_m (R2 = {config.outer_radius_m})",
     )
     room_m = 2 * config.arena_radius_m * math.sin(math.pi / config.groups) if config.groups > 1 else math.inf
     need_m = 2 * (start_grid_radius_m(config) + config.robot_radius_m)

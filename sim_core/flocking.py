@@ -292,7 +292,22 @@ def mark_followers(pos_x, pos_y, goal_x, goal_y, neighbours, counts, flags, lead
 
 @kernel
 def preferred_velocities(
-    world, pos_x, pos_y, vel_x, vel_y, goal_x, goal_y, neighbours, counts, flags, leaders, states, pref_x, pref_y, rng, f
+    world,
+    pos_x,
+    pos_y,
+    vel_x,
+    vel_y,
+    goal_x,
+    goal_y,
+    neighbours,
+    counts,
+    flags,
+    leaders,
+    states,
+    pref_x,
+    pref_y,
+    rng,
+    f,
 ):
     """Preferred velocities of all robots of one world (Algorithm 3 up to ORCA).
 
@@ -319,9 +334,7 @@ def preferred_velocities(
         if f.published and f.separation_noise > f.zero:
             pref_x[i] = uniform(rng, world)  # through the array, into the worlds' dtype
             noise = f.separation_noise * pref_x[i]
-        terms = flock_terms(
-            i, pos_x, pos_y, vel_x, vel_y, to_goal_x, to_goal_y, neighbours[i], counts[i], noise, f
-        )
+        terms = flock_terms(i, pos_x, pos_y, vel_x, vel_y, to_goal_x, to_goal_y, neighbours[i], counts[i], noise, f)
         leader = leaders[i] if leaders[i] >= 0 else i
         x, y = weighted_sum(
             state, flags[i] & SEES, terms, to_goal_x, to_goal_y, pos_x[leader] - pos_x[i], pos_y[leader] - pos_y[i], f

@@ -12,4 +12,3 @@ JIT_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": T
 def kernel(function: Any) -> Any:
     """Compiles `function` with the project's options (cached on disk, IEEE division, no fastmath)."""
     return njit(**JIT_OPTIONS)(function)
-

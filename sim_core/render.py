@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim_core.config import WorldConfig, start_grid_radius_m
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating]
 Shape = Callable[[Floats, Floats], Floats]
 """Coverage in [0, 1] of pixels whose centres lie (dx, dy) px from the shape's centre; the two broadcast."""
 
@@ -126,11 +126,11 @@ def _draw_learner(image: NDArray[np.uint8], centre_px: Floats, radius_px: float,
 
 
 def _disc(radius_px: float) -> Shape:
-    return lambda dx, dy: np.clip(radius_px + 0.5 - np.hypot(dx, dy), 0.0, 1.0)
+    return lambda dx, dy: np.clip(radius_px + 0.5 - np.sqrt(dx * dx + dy * dy), 0.0, 1.0)
 
 
 def _ring(radius_px: float, line_px: float) -> Shape:
-    return lambda dx, dy: np.clip(0.5 * line_px + 0.5 - np.abs(np.hypot(dx, dy) - radius_px), 0.0, 1.0)
+    return lambda dx, dy: np.clip(0.5 * line_px + 0.5 - np.abs(np.sqrt(dx * dx + dy * dy) - radius_px), 0.0, 1.0)
 
 
 def _frame(half_px: float, line_px: float) -> Shape:
@@ -151,12 +151,12 @@ def _paint(
     opacity: float = 1.0,
 ) -> None:
     """Blends one shape that reaches `reach_px` from its centre into `image` `[height, width, 3]`, in place."""
-    rgb = (colour_rgb(colour) if isinstance(colour, str) else colour).astype(np.float64)
+    rgb = (colour_rgb(colour) if isinstance(colour, str) else colour).astype(np.float32)
     limit = np.array(image.shape[1::-1])
     low = np.clip(np.floor(centre_px - reach_px - 1.0), 0, limit).astype(np.int64)
     high = np.clip(np.ceil(centre_px + reach_px + 1.0), 0, limit).astype(np.int64)
-    dx = np.arange(low[0], high[0]) + 0.5 - centre_px[0]
-    dy = np.arange(low[1], high[1])[:, None] + 0.5 - centre_px[1]
+    dx = (np.arange(low[0], high[0]) + 0.5 - centre_px[0]).astype(np.float32)
+    dy = (np.arange(low[1], high[1])[:, None] + 0.5 - centre_px[1]).astype(np.float32)
     patch = image[low[1] : high[1], low[0] : high[0]]
     alpha = opacity * shape(dx, dy)[..., None]
     patch[...] = np.rint(patch + alpha * (rgb - patch))

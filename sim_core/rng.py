@@ -20,7 +20,7 @@ _TO_UNIT = 1.0 / 9007199254740992.0
 
 @kernel
 def uniform(state, world):
-    """Next float64 in [0, 1) of `state[world]` (uint64 `[num_worlds]`), which moves on by one."""
+    """Next float64 in [0, 1) of `state[world]` (uint64 `[num_worlds]`), which moves on by one draw."""
     state[world] += _GOLDEN
     z = state[world]
     z = (z ^ (z >> _SHIFT_30)) * _MIX_1

@@ -15,7 +15,8 @@ def mean_pairwise_distances_m(pos: NDArray[np.floating], groups: int) -> NDArray
 
     Returns:
       `[..., groups, groups]` float64, metres. The diagonal is d_XX, where, as in the equation, each
-      robot's zero distance to itself counts.
+      robot's zero distance to itself counts. Read so, 2 d_XY - d_XX - d_YY is never negative (it is the
+      energy distance of the two groups), so that groups of equal spread count as segregated even when mixed.
     """
     points = np.asarray(pos, np.float64)
     delta = points[..., :, None, :] - points[..., None, :, :]

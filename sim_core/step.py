@@ -31,9 +31,7 @@ def swarm_params(config: WorldConfig, dtype: Any) -> SwarmParams:
     """The swarm's constants of `config`."""
     real = np.dtype(dtype).type
     return SwarmParams(
-        orca=orca_params(
-            config.orca_radius_m, config.orca_horizon_s, config.time_step_s, config.max_speed_m_s, dtype
-        ),
+        orca=orca_params(config.orca_radius_m, config.orca_horizon_s, config.time_step_s, config.max_speed_m_s, dtype),
         flock=flock_params(config, dtype),
         neighbour_range_sq=real(config.neighbour_range_m) ** 2,
         time_step_s=real(config.time_step_s),

@@ -52,9 +52,16 @@ class WorldBatch:
         self._reward = np.zeros(num_worlds, np.float32)
         self._outcome = np.zeros(num_worlds, np.int8)
         self._all = np.ones(num_worlds, np.bool_)
+        self.seed(list(range(num_worlds)))
 
     def seed(self, seeds: list[int]) -> None:
-        """Gives world i the random stream of `seeds[i]`."""
+        """Gives world i the random stream of `seeds[i]`; until then it is that of seed i.
+
+        Raises:
+          ValueError: there is not one seed a world.
+        """
+        if len(seeds) != self.num_worlds:
+            raise ValueError(f"seeds must be {self.num_worlds}, one a world, not {len(seeds)}")
         self.state.rng[:] = [world_streams(seed, 1)[0] for seed in seeds]
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> NDArray[Any]:
@@ -76,6 +83,9 @@ class WorldBatch:
 
         Returns:
           StepResult of copies.
+
+        Raises:
+          ValueError: there is not one action a world, or one is none of the actions.
         """
         if action is not None:
             self.method.velocity(self.state, action, self._command_x, self._command_y)
@@ -107,13 +117,15 @@ class WorldBatch:
         """Takes up saved arrays; returns the observations there.
 
         Raises:
-          ValueError: an array is missing or has another shape or dtype.
+          ValueError: an array is missing or has another shape or dtype; nothing is taken up.
         """
-        for name, array in self.state._asdict().items():
+        arrays = self.state._asdict()
+        for name, array in arrays.items():
             new = saved.get(name)
             if new is None or new.shape != array.shape or new.dtype != array.dtype:
                 raise ValueError(f"saved worlds do not fit: {name} should be {array.dtype}{array.shape}")
-            array[...] = new
+        for name, array in arrays.items():
+            array[...] = saved[name]
         self.method.perceive(self.state, self._all, self._observation)
         return self._observation.copy()
 

@@ -118,6 +118,8 @@ def _reward(state, outcome, out, p):
 @kernel
 def _velocity(table, action, out_x, out_y):
     for world in range(action.shape[0]):
+        if action[world] < 0 or action[world] >= table.shape[0]:
+            raise ValueError("action must be in 0..num_actions - 1")
         out_x[world] = table[action[world], 0]
         out_y[world] = table[action[world], 1]
 
@@ -146,7 +148,13 @@ class SensorMethod(Method):
         )
 
     def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
-        """Eq. 3.4: constant speed towards the chosen sector's centre."""
+        """Eq. 3.4: constant speed towards the chosen sector's centre.
+
+        Raises:
+          ValueError: there is not one action a world, or one is none of the actions.
+        """
+        if action.shape != out_x.shape:
+            raise ValueError(f"action must have the shape {out_x.shape}, one a world, not {action.shape}")
         _velocity(self._velocities, action, out_x, out_y)
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:

@@ -11,6 +11,8 @@ from matplotlib.colors import to_rgb
 
 from dashboards.curve import FAILURE_STYLES, VALUE, CurvePoint, learning_curve_png
 
+Colour = str | tuple[float, float, float]
+
 
 def rising(failures: dict[str, float] | None) -> list[CurvePoint]:
     return [CurvePoint(50_000 * k, 0.1 * k, 0.1 * k - 0.08, 0.1 * k + 0.08, failures) for k in range(1, 9)]
@@ -21,14 +23,14 @@ def draw(path: Path, rows: list[CurvePoint], **options: object) -> np.ndarray:
     return matplotlib.image.imread(path)[..., :3]
 
 
-def places(
-    image: np.ndarray, colour: str | tuple[float, ...], tolerance: float = 0.02
-) -> tuple[np.ndarray, np.ndarray]:
+def places(image: np.ndarray, colour: Colour, tolerance: float = 0.02) -> tuple[np.ndarray, np.ndarray]:
     """(rows, columns) of the pixels of a colour."""
-    return np.nonzero(np.abs(image - np.array(to_rgb(colour))).max(axis=-1) < tolerance)
+    rgb = np.array(to_rgb(colour), np.float64)
+    rows, columns = np.nonzero(np.abs(image - rgb).max(axis=-1) < tolerance)
+    return rows, columns
 
 
-def height_at(image: np.ndarray, colour: str | tuple[float, ...], share: float) -> float:
+def height_at(image: np.ndarray, colour: Colour, share: float) -> float:
     """Mean height of a colour, as a share of the image, in a narrow band at `share` of the width."""
     rows, columns = places(image, colour)
     near = np.abs(columns / image.shape[1] - share) < 0.02
@@ -39,8 +41,8 @@ def test_line_rises_with_the_values_and_the_band_surrounds_it(tmp_path: Path):
     image = draw(tmp_path / "curve.png", rising(None))
     heights = [height_at(image, VALUE, share) for share in (0.3, 0.5, 0.7, 0.9)]
     assert np.all(np.diff(heights) > 0.05)
-    band = tuple(1.0 - 0.2 * (1.0 - np.array(to_rgb(VALUE))))
-    rows, columns = places(image, band)
+    red, green, blue = (1.0 - 0.2 * (1.0 - channel) for channel in to_rgb(VALUE))
+    rows, columns = places(image, (red, green, blue))
     column = int(0.6 * image.shape[1])
     shaded, line = rows[columns == column], places(image[:, column : column + 1], VALUE)[0]
     assert shaded.min() < line.min() - 10 and shaded.max() > line.max() + 10

@@ -236,6 +236,7 @@ def test_chromium_title_is_text_and_controls_have_names(page: Any):
 def test_chromium_follows_the_colour_scheme(page: Any, scheme: str, config: WorldConfig):
     media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
     page.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+    page.execute_async_script("const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(done))")
     brightness = canvas_pixel(page, np.array([0.0, 0.0]), config).mean()
     page.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
     assert (brightness > 200) == (scheme == "light")

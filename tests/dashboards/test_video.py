@@ -7,7 +7,7 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-import imageio_ffmpeg
+import imageio_ffmpeg  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 
@@ -22,7 +22,7 @@ def decode(path: Path) -> tuple[np.ndarray, str]:
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     done = subprocess.run(command, capture_output=True, check=True)
     description = done.stderr.decode().split("Output #0")[0]
-    size = re.search(r"Video: .*? (\d+)x(\d+)", description)
+    size = re.search(r", (\d\d+)x(\d\d+)[, ]", description)
     assert size is not None, description
     return np.frombuffer(done.stdout, np.uint8).reshape(-1, int(size[2]), int(size[1]), 3), description
 

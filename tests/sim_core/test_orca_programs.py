@@ -97,7 +97,7 @@ def relax(lines, failed, v):
 def test_second_program_finds_the_nearest_permitted_velocity():
     rng = np.random.default_rng(0)
     feasible, borderline = 0, 0
-    for _ in range(600):
+    for _ in range(300):
         lines = random_lines(rng, int(rng.integers(1, 11)), rng.choice([0.2, 0.6, 1.5]))
         opt = rng.normal(0, 1.0, 2)
         margin = -least_violation(lines, LIMIT)
@@ -109,7 +109,7 @@ def test_second_program_finds_the_nearest_permitted_velocity():
         if margin > 0:
             feasible += 1
             np.testing.assert_allclose(v, nearest_permitted(lines, LIMIT, opt), atol=ATOL)
-    assert 100 < feasible < 500 and borderline < 10
+    assert 60 < feasible < 250 and borderline < 5
 
 
 def test_a_failed_row_is_the_first_that_empties_the_set():
@@ -146,7 +146,7 @@ def test_direction_goal_finds_the_farthest_permitted_velocity():
 def test_third_program_violates_the_worst_half_plane_least():
     rng = np.random.default_rng(3)
     infeasible = 0
-    for _ in range(600):
+    for _ in range(300):
         lines = random_lines(rng, int(rng.integers(2, 11)), rng.choice([0.6, 1.5, 3.0]))
         failed, v = solve(lines, rng.normal(0, 1.0, 2))
         if failed == len(lines):
@@ -155,7 +155,7 @@ def test_third_program_violates_the_worst_half_plane_least():
         v = relax(lines, failed, v)
         assert np.linalg.norm(v) < LIMIT + ATOL
         assert violation(lines, v) == pytest.approx(least_violation(lines, LIMIT), abs=1e-5)
-    assert infeasible > 200
+    assert infeasible > 100
 
 
 def test_both_programs_agree_with_slsqp():

@@ -1,0 +1,111 @@
+"""What a finished run leaves in its folder and in MLflow: config, curve, animation and policy."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+from actors.evaluator import record_episode, record_frames
+from actors.network import WeightsSnapshot
+from actors.trajectory import Episode, load_episodes, save_episodes
+from actors.vector_env import env_shape
+from dashboards.curve import CurvePoint, learning_curve_png
+from dashboards.player import player_html
+from dashboards.video import episode_frames, write_mp4
+from learner.config import RunConfig
+from learner.journal import Row
+from learner.loop import FINAL_EVAL_SEED
+from learner.results import outcome_label
+from learner.run import RunResult
+from learner.run_folder import RunFolder
+from learner.tracker import Tracker
+from sim_core.outcomes import ENDED, Outcome
+
+EPISODES_TRIED = 10
+"""Episodes among which the animated one is looked for: the first success."""
+VIDEO_SIZE_PX = 480
+
+
+def log_artifacts(folder: RunFolder, config: RunConfig, tracker: Tracker, result: RunResult, rows: list[Row]) -> None:
+    """Makes all artifacts of a finished run and uploads them."""
+    assert result.weights is not None
+    folder.artifacts.mkdir(exist_ok=True)
+    made = [folder.path / "config.json", _curve(folder, config, rows)]
+    if config.env.is_swarm:
+        made += _swarm_animation(folder, config, result.weights)
+    else:
+        made += foreign_animation(config, result.weights, FINAL_EVAL_SEED, folder.artifacts / "episode.mp4")
+    for path in made:
+        if path.exists():
+            tracker.artifact(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # MLflow's own, about its schema inference
+        tracker.log_policy(result.weights, config, env_shape(config.env))
+
+
+def curve_points(rows: list[Row]) -> list[CurvePoint]:
+    """The evaluations among a run's rows, in order of env steps."""
+    points = []
+    for row in sorted(rows, key=lambda row: row.env_steps):
+        metrics = row.metrics
+        name = "success_rate" if "eval/success_rate" in metrics else "return"
+        if f"eval/{name}_low" not in metrics:
+            continue
+        failures = (
+            {kind.name.lower(): metrics[f"eval/{outcome_label(kind)}"] for kind in ENDED if kind is not Outcome.GOAL}
+            if name == "success_rate"
+            else None
+        )
+        value, low, high = (metrics[f"eval/{name}{suffix}"] for suffix in ("", "_low", "_high"))
+        points.append(CurvePoint(row.env_steps, value, low, high, failures))
+    return points
+
+
+def _curve(folder: RunFolder, config: RunConfig, rows: list[Row]) -> Path:
+    path = folder.artifacts / "learning_curve.png"
+    points = curve_points(rows)
+    if not points:
+        return path
+    is_share = points[0].failures is not None
+    title = f"{config.world.method} {config.world.setup}" if config.env.is_swarm else config.env_id
+    learning_curve_png(points, path, title, "success rate" if is_share else "mean return", is_share)
+    return path
+
+
+def _swarm_animation(folder: RunFolder, config: RunConfig, weights: WeightsSnapshot) -> list[Path]:
+    episode = _first_success(config, weights)
+    store, page = folder.artifacts / "episode.zarr", folder.artifacts / "episode.html"
+    save_episodes(store, [episode], config.world)
+    write_player(store, page, f"{config.world.method} {config.world.setup}")
+    return [store, page]
+
+
+def _first_success(config: RunConfig, weights: WeightsSnapshot) -> Episode:
+    episodes = (record_episode(config.env, weights, FINAL_EVAL_SEED + i) for i in range(EPISODES_TRIED))
+    first = next(episodes)
+    if first.outcome == Outcome.GOAL:
+        return first
+    return next((episode for episode in episodes if episode.outcome == Outcome.GOAL), first)
+
+
+def write_player(store: Path, page: Path, title: str) -> None:
+    """Writes the player of the first episode recorded in `store` to `page`."""
+    episodes, world = load_episodes(store)
+    part = page.with_name(page.name + ".part")
+    part.write_text(player_html(episodes[0], world, title), "utf-8")
+    part.replace(page)
+
+
+def write_video(store: Path, path: Path) -> None:
+    """Writes the first episode recorded in `store` as mp4 to `path`, at the speed of the world."""
+    episodes, world = load_episodes(store)
+    write_mp4(episode_frames(episodes[0], world, VIDEO_SIZE_PX), path, 1 / world.time_step_s)
+
+
+def foreign_animation(config: RunConfig, weights: WeightsSnapshot, seed: int, path: Path) -> list[Path]:
+    """Writes one episode of a Gymnasium environment as mp4; nothing if it cannot be rendered."""
+    frames, frames_per_s = record_frames(config.env, weights, seed)
+    if not frames:
+        return []
+    write_mp4(frames, path, frames_per_s)
+    return [path]

@@ -1,0 +1,53 @@
+"""Tables that commands end with."""
+
+from __future__ import annotations
+
+import shlex
+
+from rich.table import Table
+
+from learner.checkpoint import newest_valid
+from learner.results import Estimate, Evaluation, outcome_label
+from learner.run import RunResult
+from learner.run_folder import RunFolder
+
+
+def evaluation_table(evaluation: Evaluation, title: str) -> Table:
+    """Every outcome's rate, the return and the length, with 95 % intervals."""
+    table = Table(title=f"{title}: {evaluation.episodes} greedy episodes", title_justify="left")
+    table.add_column("result")
+    table.add_column("value", justify="right")
+    table.add_column("95 % interval", justify="right")
+    for outcome, estimate in evaluation.rates.items():
+        table.add_row(outcome_label(outcome).replace("_", " "), *_percent(estimate))
+    table.add_row("mean return", *_plain(evaluation.episode_return, 2))
+    table.add_row("mean episode length (env steps)", *_plain(evaluation.episode_length, 1))
+    return table
+
+
+def _percent(estimate: Estimate) -> tuple[str, str]:
+    value, low, high = (100 * number for number in estimate)
+    return f"{value:.1f} %", f"{low:.1f} … {high:.1f} %"
+
+
+def _plain(estimate: Estimate, digits: int) -> tuple[str, str]:
+    return f"{estimate.value:.{digits}f}", f"{estimate.low:.{digits}f} … {estimate.high:.{digits}f}"
+
+
+def summary_table(folder: RunFolder, result: RunResult, tracking_uri: str, is_swarm: bool) -> Table:
+    """What a finished run left behind, and how to look at it."""
+    table = Table(show_header=False, box=None)
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    checkpoint, _ = newest_valid(folder.checkpoints)
+    animation = "episode.html" if is_swarm else "episode.mp4"
+    table.add_row("trained", f"{result.env_steps:,} env steps, {result.updates:,} updates")
+    table.add_row("checkpoint", str(checkpoint.folder))
+    table.add_row("curve", str(folder.artifacts / "learning_curve.png"))
+    table.add_row("animation", str(folder.artifacts / animation))
+    if tracking_uri.startswith("sqlite:"):
+        table.add_row("MLflow UI", f"mlflow ui --backend-store-uri {shlex.quote(tracking_uri)}")
+    else:
+        table.add_row("MLflow", tracking_uri)
+    table.add_row("evaluate", f"shoal evaluate {shlex.quote(str(folder.path))}")
+    return table

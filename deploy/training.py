@@ -1,0 +1,119 @@
+"""`shoal train` and `shoal resume`: a run with its display, and what it leaves behind."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import shlex
+import signal
+from pathlib import Path
+
+from rich.console import Console
+
+from actors.vector_env import env_shape
+from deploy.artifacts import log_artifacts
+from deploy.options import Launch, Resume, Train, ray_address
+from deploy.progress import make_display
+from deploy.tables import evaluation_table, summary_table
+from learner.checkpoint import Checkpoint
+from learner.config import RunConfig
+from learner.journal import Row
+from learner.run import RunResult, execute, resume_point
+from learner.run_folder import RunFolder, RunIdentity, find_run
+from learner.tracker import Tracker
+from sim_core.config import ConfigError, require
+
+
+def run_name(config: RunConfig) -> str:
+    """The run's name in MLflow, such as `sensor 10r x 2g s0`."""
+    if not config.env.is_swarm:
+        return f"{config.env_id} s{config.seed}"
+    return f"{config.world.method} {config.world.setup} s{config.seed}"
+
+
+def _new_folder(config: RunConfig, launch: Launch) -> RunFolder:
+    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    base = run_name(config).replace("×", "").replace(" ", "-").replace("/", "-")
+    folder = launch.runs_dir / (launch.name or f"{base}-{stamp}")
+    require(
+        not folder.exists(),
+        f"{folder} exists already; choose another --name, or go on with `shoal resume {folder.name}`",
+    )
+    return RunFolder(folder)
+
+
+def train(command: Train) -> int:
+    """Starts a run; returns the exit code."""
+    config, launch = command.run, command.launch
+    require(
+        launch.name is None or (launch.name == Path(launch.name).name and launch.name not in ("", ".", "..")),
+        f"--name must be a plain folder name, not {launch.name!r}",
+    )
+    folder = _new_folder(config, launch)
+    _make_folder(launch.runs_dir)
+    env_shape(config.env)  # refuses an environment that cannot be made
+    tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
+    tracker.start(config, run_name(config), config.world.method if config.env.is_swarm else "none")
+    folder.save_config(config)
+    folder.save_identity(RunIdentity(run_name(config), tracker.uri, launch.experiment, tracker.run_id))
+    return _run(folder, config, tracker, None, launch.ray_address())
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--runs-dir {path} cannot be made ({error}); name a folder that you may write to") from error
+
+
+def resume(command: Resume) -> int:
+    """Goes on with a run; returns the exit code."""
+    folder = find_run(command.run, command.runs_dir)
+    config, identity = folder.config(), folder.identity()
+    checkpoint, skipped = resume_point(folder, config)
+    config = _extended(config, command.total_env_steps, checkpoint.state["env_steps"])
+    tracker = Tracker(identity.tracking_uri, identity.experiment, None)
+    tracker.resume(identity.mlflow_run_id)
+    folder.save_config(config)
+    console = Console()
+    for reason in skipped:
+        console.print(f"skipped: {reason}", highlight=False)
+    console.print(f"going on from {checkpoint.folder}", highlight=False, soft_wrap=True)
+    return _run(folder, config, tracker, checkpoint, ray_address(command.address))
+
+
+def _extended(config: RunConfig, total_env_steps: int | None, done: int) -> RunConfig:
+    if total_env_steps is not None:
+        config = dataclasses.replace(config, total_env_steps=total_env_steps)
+    require(
+        done < config.total_env_steps,
+        f"the run has finished its {config.total_env_steps} env steps; train on with --total-env-steps greater than {done}",
+    )
+    return config
+
+
+def _run(
+    folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, address: str | None
+) -> int:
+    console = Console()
+    console.print(f"run {folder.path}", highlight=False, soft_wrap=True)
+    with make_display(console, config.total_env_steps) as display:
+
+        def finish(result: RunResult, rows: list[Row]) -> None:
+            display.message("logging curve, animation and policy")
+            log_artifacts(folder, config, tracker, result, rows)
+
+        result = execute(folder, config, tracker, display, checkpoint, address, finish)
+    if result.evaluation is None:
+        name = signal.Signals(result.stopped_by).name if result.stopped_by else "a signal"
+        console.print(f"stopped by {name} at {result.env_steps:,} env steps; checkpoint saved", highlight=False)
+        console.print(f"go on with: {resume_command(folder)}", highlight=False, soft_wrap=True)
+        return 128 + (result.stopped_by or 0)
+    console.print(evaluation_table(result.evaluation, run_name(config)))
+    console.print(summary_table(folder, result, tracker.uri, config.env.is_swarm), soft_wrap=True)
+    return 0
+
+
+def resume_command(folder: RunFolder) -> str:
+    """The command that goes on with a run, from anywhere."""
+    return f"shoal resume {shlex.quote(str(folder.path))}"

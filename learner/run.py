@@ -1,0 +1,164 @@
+"""One run as a whole: folder, tracker, cluster and loop put together, started or resumed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from actors.network import WeightsSnapshot
+from learner.checkpoint import Checkpoint, CheckpointError, newest_valid
+from learner.cluster import Cluster, process_cluster
+from learner.config import RunConfig, config_hash
+from learner.journal import Journal, PushedMark, Row
+from learner.loop import TrainingLoop
+from learner.ray_edge import ray_cluster
+from learner.results import Evaluation, as_metrics
+from learner.run_folder import RunFolder
+from learner.stopping import stop_on_signals
+from learner.tracker import Tracker
+
+
+class Display(Protocol):
+    """What shows a run to a person."""
+
+    def row(self, row: Row) -> None:
+        """A row of metrics was written."""
+        ...
+
+    def message(self, text: str) -> None:
+        """Something worth a line happened."""
+        ...
+
+
+class RunResult(NamedTuple):
+    """How a run ended; `evaluation` and `weights` are None if a signal stopped it before its end."""
+
+    env_steps: int
+    updates: int
+    stopped_by: int | None
+    evaluation: Evaluation | None
+    weights: WeightsSnapshot | None
+
+
+class MirroringObserver:
+    """Passes rows on to the display, and to MLflow once a checkpoint covers them.
+
+    Args:
+      tracker: the MLflow run.
+      journal: the run's journal.
+      pushed: remembers how much of it MLflow has.
+      display: shows rows to a person.
+    """
+
+    def __init__(self, tracker: Tracker, journal: Journal, pushed: PushedMark, display: Display) -> None:
+        self._tracker = tracker
+        self._journal = journal
+        self._pushed = pushed
+        self._display = display
+
+    def row(self, row: Row) -> None:
+        """Shows the row."""
+        self._display.row(row)
+
+    def checkpoint(self, folder: Path, journal_offset: int) -> None:
+        """Pushes the rows that the checkpoint covers; what fails is pushed with the next checkpoint."""
+        try:
+            self._tracker.push(self._journal.rows(self._pushed.read()))
+        except Exception as error:  # the client raises its own, requests' and SQLAlchemy's errors alike
+            self._display.message(f"MLflow did not take the metrics, they will be sent again: {_first_line(error)}")
+            return
+        self._pushed.write(journal_offset)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def open_cluster(config: RunConfig, incarnation: int, address: str | None) -> Cluster:
+    """The run's parts under its engine."""
+    if config.engine == "process":
+        return process_cluster(config, incarnation)
+    return ray_cluster(config, incarnation, address)
+
+
+def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list[str]]:
+    """The newest usable checkpoint of a run, and why newer ones were skipped.
+
+    Raises:
+      CheckpointError: there is none, or it belongs to another config.
+    """
+    checkpoint, skipped = newest_valid(folder.checkpoints)
+    if checkpoint.state["config_hash"] != config_hash(config):
+        raise CheckpointError(
+            f"checkpoint {checkpoint.folder} was made with another config than {folder.path / 'config.json'}: "
+            "only total_env_steps and engine may change between two sittings"
+        )
+    return checkpoint, skipped
+
+
+def execute(
+    folder: RunFolder,
+    config: RunConfig,
+    tracker: Tracker,
+    display: Display,
+    checkpoint: Checkpoint | None,
+    address: str | None,
+    finish: Callable[[RunResult, list[Row]], None],
+) -> RunResult:
+    """Trains from the start or from `checkpoint`, evaluates, and closes the MLflow run.
+
+    Args:
+      folder: the run's folder.
+      config: the run.
+      tracker: its MLflow run, started or resumed.
+      display: shows progress.
+      checkpoint: where to go on, None for a fresh start.
+      address: Ray cluster, None for this machine.
+      finish: makes and logs the artifacts of a finished run from the result and all rows of metrics.
+
+    Returns:
+      How the run ended; the MLflow run is FINISHED, KILLED (stopped by a signal, resumable) or FAILED.
+    """
+    state = checkpoint.state if checkpoint else {"incarnation": -1, "journal_offset": 0}
+    journal = Journal(folder.journal, state["journal_offset"])
+    status = "FAILED"
+    try:
+        cluster = open_cluster(config, state["incarnation"] + 1, address)
+        try:
+            result = _train(folder, config, tracker, display, checkpoint, journal, cluster)
+        finally:
+            cluster.close()
+        if result.evaluation is not None:
+            tracker.final(as_metrics(result.evaluation), journal.rows()[-1].time_ms)
+            finish(result, journal.rows())
+        status = "FINISHED" if result.stopped_by is None else "KILLED"
+        return result
+    except KeyboardInterrupt:
+        status = "KILLED"
+        raise
+    finally:
+        journal.close()
+        tracker.end(status)
+
+
+def _train(
+    folder: RunFolder,
+    config: RunConfig,
+    tracker: Tracker,
+    display: Display,
+    checkpoint: Checkpoint | None,
+    journal: Journal,
+    cluster: Cluster,
+) -> RunResult:
+    observer = MirroringObserver(tracker, journal, PushedMark(folder.pushed, journal.sync()), display)
+    with stop_on_signals() as stop:
+        loop = TrainingLoop(config, cluster, journal, folder.checkpoints, observer, stop)
+        if checkpoint is not None:
+            loop.restore(checkpoint)
+        finished = loop.run()
+        if not finished:
+            return RunResult(loop.env_steps, loop.updates, stop.signal, None, None)
+        display.message(f"training done; evaluating {config.final_eval_episodes} greedy episodes")
+        evaluation, weights = loop.final_evaluation(), loop.newest_weights()
+        return RunResult(loop.env_steps, loop.updates, None, evaluation, weights)

@@ -1,0 +1,97 @@
+"""A run's folder: its config, its MLflow identity, its journal and its checkpoints."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from learner.config import RunConfig, from_dict, to_dict
+from sim_core.config import ConfigError
+
+
+class RunIdentity(NamedTuple):
+    """Where the run is logged: run name, MLflow tracking URI, experiment and run id."""
+
+    name: str
+    tracking_uri: str
+    experiment: str
+    mlflow_run_id: str
+
+
+class RunFolder:
+    """Paths under one run's folder, and its two small files.
+
+    Args:
+      path: the folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path.absolute()
+        self.checkpoints = self.path / "checkpoints"
+        self.journal = self.path / "metrics.jsonl"
+        self.pushed = self.path / "metrics.pushed"
+        self.artifacts = self.path / "artifacts"
+
+    def save_config(self, config: RunConfig) -> None:
+        """Writes `config.json`."""
+        _write(self.path / "config.json", to_dict(config))
+
+    def config(self) -> RunConfig:
+        """Reads `config.json`.
+
+        Raises:
+          ConfigError: the file is missing, no JSON, or holds another version's config.
+        """
+        return from_dict(_read(self.path / "config.json"))
+
+    def save_identity(self, identity: RunIdentity) -> None:
+        """Writes `run.json`."""
+        _write(self.path / "run.json", identity._asdict())
+
+    def identity(self) -> RunIdentity:
+        """Reads `run.json`.
+
+        Raises:
+          ConfigError: the file is missing or no run's.
+        """
+        values = _read(self.path / "run.json")
+        try:
+            return RunIdentity(**values)
+        except TypeError as error:
+            raise ConfigError(f"{self.path / 'run.json'} does not name a run; train anew") from error
+
+
+def find_run(name: str, runs_dir: Path) -> RunFolder:
+    """The run that a user names: a path, or a folder under `runs_dir`.
+
+    Raises:
+      ConfigError: there is none.
+    """
+    for path in (Path(name), runs_dir / name):
+        if (path / "config.json").is_file():
+            return RunFolder(path)
+    known = sorted(path.parent.name for path in runs_dir.glob("*/config.json"))
+    hint = f"runs there: {', '.join(known[-5:])}" if known else f"there are no runs in {runs_dir}"
+    raise ConfigError(f"there is no run {name!r}; {hint}")
+
+
+def _write(path: Path, values: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    with part.open("w") as file:
+        json.dump(values, file, indent=2)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be read ({error}); name another run or train anew") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path} is no config; name another run or train anew")
+    return values

@@ -1,0 +1,157 @@
+"""WorldConfig: every refusal names its field, every setup of the dissertation is accepted."""
+
+import dataclasses
+import itertools
+import math
+
+import pytest
+
+from sim_core.config import ANGLES, MAX_HEADINGS, NON_NEGATIVE, POSITIVE, ConfigError, WorldConfig, start_grid_radius_m
+
+DEFAULTS = {field.name: field.default for field in dataclasses.fields(WorldConfig)}
+WHOLE = [name for name, value in DEFAULTS.items() if type(value) is int]
+REALS = [name for name, value in DEFAULTS.items() if type(value) is float]
+FLAGS = [name for name, value in DEFAULTS.items() if type(value) is bool]
+NAMES = [name for name, value in DEFAULTS.items() if type(value) is str]
+
+
+def refuses(field, **settings):
+    """Checks that the settings are refused with a message that names `field`."""
+    with pytest.raises(ConfigError, match=rf"\b{field}\b"):
+        WorldConfig(**settings)
+
+
+@pytest.mark.parametrize(
+    ("robots", "groups", "method"), list(itertools.product((5, 10, 15, 20, 25), (1, 2, 3, 4, 8), ("sensor",)))
+)
+def test_setups_of_the_dissertation_are_accepted(robots, groups, method):
+    config = WorldConfig(robots=robots, groups=groups, method=method)
+    assert config.num_robots == robots * groups
+    assert config.setup == f"{robots}r×{groups}g"
+
+
+def test_table_3_2_is_the_default():
+    config = WorldConfig()
+    assert (config.inner_radius_m, config.outer_radius_m, config.learner_speed_m_s) == (0.5, 1.5, 1.0)
+    assert (config.horizon_steps, config.reward_scale) == (500, 1.0)
+
+
+def test_fields_are_of_four_kinds_and_every_real_one_has_a_bound():
+    assert len(WHOLE) + len(REALS) + len(FLAGS) + len(NAMES) == len(DEFAULTS)
+    assert sorted(POSITIVE + NON_NEGATIVE + ANGLES) == sorted(REALS)
+
+
+@pytest.mark.parametrize("name", REALS)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, "1", None, True])
+def test_reals_must_be_finite_numbers(name, value):
+    refuses(name, **{name: value})
+
+
+@pytest.mark.parametrize("name", WHOLE)
+@pytest.mark.parametrize("value", [3.0, "3", None, True])
+def test_whole_numbers_must_be_whole(name, value):
+    refuses(name, **{name: value})
+
+
+@pytest.mark.parametrize("name", FLAGS)
+@pytest.mark.parametrize("value", [1, 0.0, "yes", None])
+def test_flags_must_be_bool(name, value):
+    refuses(name, **{name: value})
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("value", ["", "other", 1, None])
+def test_names_must_be_known(name, value):
+    refuses(name, **{name: value})
+
+
+@pytest.mark.parametrize("name", POSITIVE)
+@pytest.mark.parametrize("value", [0.0, -1.0, 0])
+def test_positive_fields(name, value):
+    refuses(name, **{name: value})
+
+
+@pytest.mark.parametrize("name", NON_NEGATIVE)
+def test_non_negative_fields(name):
+    refuses(name, **{name: -0.01})
+    WorldConfig(**{name: 0.0})
+
+
+@pytest.mark.parametrize("name", ANGLES)
+def test_angles(name):
+    refuses(name, **{name: 0.0})
+    refuses(name, **{name: 180.1})
+    WorldConfig(**{name: 180.0})
+
+
+@pytest.mark.parametrize(
+    ("name", "below", "lowest", "highest", "above"),
+    [
+        ("robots", 1, 2, None, None),
+        ("groups", 0, 1, None, None),
+        ("sectors", 1, 2, MAX_HEADINGS, MAX_HEADINGS + 1),
+        ("horizon_steps", 0, 1, None, None),
+        ("max_neighbours", 0, 1, 64, 65),
+    ],
+)
+def test_counts(name, below, lowest, highest, above):
+    refuses(name, **{name: below})
+    assert getattr(WorldConfig(**{name: lowest}), name) == lowest
+    if highest is not None:
+        assert getattr(WorldConfig(**{name: highest}), name) == highest
+        refuses(name, **{name: above})
+
+
+def test_too_many_robots_for_one_world():
+    for field in ("robots", "groups"):
+        refuses(field, robots=1001, groups=100, arena_radius_m=1e5)
+
+
+def test_pairs_that_contradict_each_other():
+    for field in ("inner_radius_m", "outer_radius_m"):
+        refuses(field, inner_radius_m=1.5, outer_radius_m=1.5)
+    for field in ("orca_radius_m", "robot_radius_m"):
+        refuses(field, orca_radius_m=0.09)
+    WorldConfig(orca_radius_m=0.1)
+
+
+@pytest.mark.parametrize("speed", ["max_speed_m_s", "learner_speed_m_s"])
+def test_a_robot_may_not_jump_past_another(speed):
+    refuses("time_step_s", **{speed: 5.0})
+    WorldConfig(**{speed: 4.0})
+
+
+def test_robots_may_not_overlap_at_the_start():
+    refuses("start_spacing_m", start_spacing_m=0.29)
+    WorldConfig(start_spacing_m=0.31)
+    refuses("start_jitter_m", start_jitter_m=0.13)
+
+
+def test_the_learning_robot_may_not_start_lost():
+    WorldConfig(start_spacing_m=1.3)
+    refuses("start_spacing_m", start_spacing_m=1.4)
+    # neighbours on the grid can be shifted apart on both axes: hypot(1.48, 0.28) > 1.5 > 1.48
+    refuses("start_jitter_m", robots=2, start_spacing_m=1.2, start_jitter_m=0.14)
+
+
+def test_groups_must_fit_the_circle():
+    for field in ("arena_radius_m", "robots", "groups"):
+        refuses(field, robots=25, groups=8, arena_radius_m=3.0)
+    refuses("arena_radius_m", robots=25, groups=2, arena_radius_m=1.4)
+
+
+def test_start_grid_radius_reaches_the_corner():
+    config = WorldConfig(robots=10, start_spacing_m=0.5, start_jitter_m=0.1)  # a grid of 3 rows by 4 columns
+    assert start_grid_radius_m(config) == pytest.approx(math.hypot(0.75 + 0.1, 0.5 + 0.1))
+
+
+def test_the_configuration_is_frozen_and_refuses_unknown_keys():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        WorldConfig().robots = 3
+    with pytest.raises(TypeError, match="wheels"):
+        WorldConfig(wheels=4)
+
+
+def test_stop_action_adds_one():
+    assert WorldConfig(sectors=6).num_actions == 6
+    assert WorldConfig(sectors=6, stop_action=True).num_actions == 7

@@ -1,0 +1,113 @@
+"""Outcomes: hand-made scenes, edges and precedence."""
+
+import numpy as np
+import pytest
+
+from sim_core.outcomes import ENDED, OUTCOME_NAMES, Outcome, collides, end_of_step, group_goal_distance_m, sensed
+
+REAL = np.float32
+RANGE_M, CONTACT_M = 1.5, 0.2
+FAR = 50.0
+ROBOT, MATE, OTHER_A, OTHER_B = range(4)
+
+
+def outcome(pos, goal=(FAR, FAR), robot=ROBOT):
+    """Outcome of two groups of two (robots 0, 1 and 2, 3)."""
+    pos_x, pos_y = np.ascontiguousarray(np.asarray(pos, REAL).T)
+    goal_x, goal_y = np.array([goal[0], -FAR], REAL), np.array([goal[1], -FAR], REAL)
+    contact_sq = REAL(CONTACT_M) ** 2
+    return Outcome(end_of_step(robot, 2, pos_x, pos_y, goal_x, goal_y, contact_sq, REAL(RANGE_M)))
+
+
+ALONE = [(0, 0), (9, 0), (0, 9), (0, -9)]
+TOGETHER = [(0, 0), (1.0, 0), (0, 9), (0, -9)]
+SURROUNDED = [(0, 0), (9, 0), (1.0, 0), (0, -9)]
+MIXED = [(0, 0), (1.0, 0), (-1.0, 0), (0, 1.2)]
+
+
+def test_each_outcome():
+    assert outcome(TOGETHER) is Outcome.RUNNING
+    assert outcome(MIXED) is Outcome.RUNNING
+    assert outcome(ALONE) is Outcome.LOST
+    assert outcome(SURROUNDED) is Outcome.CAPTURED
+    assert outcome([(0, 0), (0.19, 0), (0, 9), (0, -9)]) is Outcome.COLLISION
+    assert outcome([(0, 0), (1.0, 0), (0, 0.19), (0, -9)]) is Outcome.COLLISION
+    assert outcome(TOGETHER, goal=(0.5, 0)) is Outcome.GOAL
+
+
+def test_collision_comes_before_goal():
+    touching = [(0, 0), (0.1, 0), (0, 9), (0, -9)]
+    assert outcome(touching, goal=(0.05, 0)) is Outcome.COLLISION
+
+
+def test_goal_comes_before_lost_and_captured():
+    apart = [(-1.0, 0), (1.0, 0), (0, 9), (0, -9)]  # 2 m from each other, 1 m from the goal
+    assert outcome(apart) is Outcome.LOST
+    assert outcome(apart, goal=(0, 0)) is Outcome.GOAL
+    apart[OTHER_A] = (-1.0, 0.5)
+    assert outcome(apart) is Outcome.CAPTURED
+    assert outcome(apart, goal=(0, 0)) is Outcome.GOAL
+
+
+def test_collision_comes_before_captured():
+    assert outcome([(0, 0), (9, 0), (0.1, 0), (0, -9)]) is Outcome.COLLISION
+
+
+def test_a_crash_between_others_is_no_collision():
+    assert outcome([(0, 0), (1.0, 0), (5, 5), (5, 5.05)]) is Outcome.RUNNING
+    assert outcome([(0, 0), (1.0, 0), (1.0, 0.05), (5, 5)]) is Outcome.RUNNING
+
+
+def test_groups_are_those_of_the_robot_asked_about():
+    assert outcome([(0, 9), (0, -9), (0, 0), (1.0, 0)], robot=OTHER_A) is Outcome.RUNNING
+    assert outcome([(0, 0.5), (0, -9), (0, 0), (9, 0)], robot=OTHER_B) is Outcome.LOST
+    assert outcome([(8.9, 1), (0, -9), (0, 0), (9, 0)], robot=OTHER_B) is Outcome.CAPTURED
+    assert outcome([(0, 0), (1, 0), (30, 30), (31, 30)], goal=(0.5, 0), robot=OTHER_A) is Outcome.RUNNING
+
+
+def test_edges_are_open():
+    def just_below(value):
+        return float(np.nextafter(REAL(value), REAL(-1)))
+
+    assert outcome([(0, 0), (1.5, 0), (0, 9), (0, -9)]) is Outcome.LOST
+    assert outcome([(0, 0), (just_below(1.5), 0), (0, 9), (0, -9)]) is Outcome.RUNNING
+    assert outcome([(0, 0), (0.2, 0), (0, 9), (0, -9)]) is Outcome.RUNNING
+    assert outcome([(0, 0), (just_below(0.2), 0), (0, 9), (0, -9)]) is Outcome.COLLISION
+    # mean distance of the group, not the learning robot's own: 0.5 and 2.5 give 1.5
+    pair = [(0.5, 0), (2.5, 0), (0, 9), (0, -9)]
+    assert outcome(pair, goal=(0, 0)) is Outcome.LOST
+    assert outcome([(0.5, 0), (2.49, 0), (0, 9), (0, -9)], goal=(0, 0)) is Outcome.GOAL
+
+
+def test_mean_goal_distance_matches_numpy():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        robots, groups = int(rng.integers(2, 26)), int(rng.integers(1, 9))
+        pos = rng.normal(0, 5, (robots * groups, 2)).astype(REAL)
+        goal = rng.normal(0, 5, (groups, 2)).astype(REAL)
+        for g in range(groups):
+            own = pos[g * robots : (g + 1) * robots].astype(np.float64)
+            expected = np.linalg.norm(own - goal[g], axis=1).mean()
+            args = (*np.ascontiguousarray(pos.T), *np.ascontiguousarray(goal.T))
+            assert group_goal_distance_m(g, robots, *args) == pytest.approx(expected, rel=1e-6)
+
+
+def test_sensing_and_contact_match_numpy():
+    rng = np.random.default_rng(1)
+    for _ in range(100):
+        pos = rng.uniform(-1.5, 1.5, (30, 2)).astype(REAL)
+        robot = int(rng.integers(30))
+        delta = pos - pos[robot]
+        dist_sq = delta[:, 0] * delta[:, 0] + delta[:, 1] * delta[:, 1]
+        near = (dist_sq < REAL(1)) & (np.arange(30) != robot)
+        own = np.arange(30) // 10 == robot // 10
+        pos_x, pos_y = np.ascontiguousarray(pos.T)
+        assert sensed(robot, 10, pos_x, pos_y, REAL(1)) == ((near & own).sum(), (near & ~own).sum())
+        nearest_sq = np.delete(dist_sq, robot).min()
+        assert not collides(robot, pos_x, pos_y, nearest_sq)
+        assert collides(robot, pos_x, pos_y, np.nextafter(nearest_sq, REAL(9)))
+
+
+def test_names_and_ends():
+    assert OUTCOME_NAMES == ("running", "goal", "lost", "captured", "collision", "timeout")
+    assert Outcome.RUNNING not in ENDED and len(ENDED) == 5 and int(Outcome.RUNNING) == 0
