@@ -1,0 +1,1 @@
+"""What runs many times: policy, exploration, rollout worker, replay shard, evaluator."""

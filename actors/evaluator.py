@@ -12,7 +12,7 @@ from actors.network import Policy, WeightsSnapshot
 from actors.rollout import join_stats
 from actors.trajectory import Episode
 from actors.transitions import NO_OUTCOME, EpisodeStats
-from actors.vector_env import EnvSpec, make_vector_env
+from actors.vector_env import EnvSpec, make_vector_env, reset_seeded
 from sim_core.worlds import WorldBatch, is_done
 
 MAX_ENVS = 250
@@ -34,7 +34,7 @@ def _play(spec: EnvSpec, policy: Policy, seeds: list[int]) -> EpisodeStats:
     count = len(seeds)
     stats = EpisodeStats(np.full(count, NO_OUTCOME, np.int8), np.zeros(count, np.int32), np.zeros(count))
     env = make_vector_env(spec, count)
-    observation, _ = env.reset(seed=list(seeds))
+    observation = reset_seeded(env, seeds)
     running = np.ones(count, np.bool_)
     while running.any():
         observation, reward, terminated, truncated, infos = env.step(policy.greedy(observation))

@@ -92,4 +92,5 @@ class Policy:
 
     def greedy(self, observation: NDArray[np.generic]) -> NDArray[np.int64]:
         """Best actions `[batch]`; the lowest index among equals."""
-        return np.argmax(self.values(observation), axis=1)
+        best: NDArray[np.int64] = np.argmax(self.values(observation), axis=1)
+        return best

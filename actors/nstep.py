@@ -70,7 +70,7 @@ class NStepAssembler:
     def _take(
         self, age: int, leaves: NDArray[np.bool_], next_observation: NDArray[Any], terminated: NDArray[np.bool_]
     ) -> NDArray[Any]:
-        rows = self._waiting[age, leaves]
+        rows: NDArray[Any] = self._waiting[age, leaves]
         rows["reward"] = self._returns[age, leaves]
         span = self._count[leaves] - age
         rows["discount"] = np.where(terminated[leaves], 0.0, self._powers[span])

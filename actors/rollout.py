@@ -18,7 +18,7 @@ from actors.transitions import (
     TransitionBlock,
     transition_dtype,
 )
-from actors.vector_env import EnvSpec, final_observations, make_vector_env
+from actors.vector_env import EnvSpec, final_observations, make_vector_env, reset_seeded, spaces_of
 from sim_core.envs import SwarmVectorEnv
 
 
@@ -48,17 +48,17 @@ class RolloutWorker:
         self._incarnation = incarnation
         self._sequence = 0
         self._env = make_vector_env(settings.env, settings.num_envs)
-        self._num_actions = int(self._env.single_action_space.n)
-        self._dtype = transition_dtype(self._env.single_observation_space)
+        shape = spaces_of(self._env)
+        self._num_actions = shape.num_actions
+        self._dtype = transition_dtype(shape.observation_space)
         seeds = np.random.SeedSequence((settings.seed, worker_id, incarnation))
         env_seeds, policy_seed = seeds.spawn(2)
         self._rng = np.random.Generator(np.random.PCG64(policy_seed))
         self._nstep = NStepAssembler(self._dtype, settings.num_envs, settings.n_step, settings.discount)
         self._length = np.zeros(settings.num_envs, np.int32)
         self._return = np.zeros(settings.num_envs, np.float64)
-        self._observation, _ = self._env.reset(
-            seed=[int(word) for word in env_seeds.generate_state(settings.num_envs) // 2]
-        )
+        words = env_seeds.generate_state(settings.num_envs) // 2  # Gymnasium takes 31 bits
+        self._observation = reset_seeded(self._env, [int(word) for word in words])
         self._policy: Policy | None = None
 
     def set_weights(self, weights: WeightsSnapshot) -> None:
@@ -138,7 +138,9 @@ class RolloutWorker:
         self._rng.bit_generator.state = meta["rng"]
         if meta["policy"] is not None:
             count = sum(name.startswith("policy_") for name in arrays)
-            self.set_weights(WeightsSnapshot(*meta["policy"], tuple(arrays[f"policy_{i}"] for i in range(count))))
+            version, time_s = meta["policy"]
+            layers = tuple(arrays[f"policy_{i}"] for i in range(count))
+            self.set_weights(WeightsSnapshot(version, time_s, layers))
         if not isinstance(self._env, SwarmVectorEnv):
             return
         worlds = {name[6:]: array for name, array in arrays.items() if name.startswith("world_")}

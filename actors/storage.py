@@ -28,7 +28,7 @@ def save_rows(path: Path, rows: NDArray[Any]) -> None:
             name, shape=column.shape, dtype=column.dtype, chunks=chunks, compressors=None, fill_value=0
         )
         array[...] = column
-        crc[name] = zlib.crc32(column)
+        crc[name] = zlib.crc32(column.tobytes())
     root.attrs.update({"format": FORMAT, "rows": len(rows), "crc32": crc})
 
 
@@ -57,7 +57,7 @@ def _read_columns(path: Path, root: zarr.Group, dtype: np.dtype[Any]) -> NDArray
             raise ValueError(
                 f"column {name} of {path} is {column.dtype}{column.shape}, not {rows[name].dtype}{rows[name].shape}"
             )
-        if zlib.crc32(column) != attributes["crc32"][name]:
+        if zlib.crc32(column.tobytes()) != attributes["crc32"][name]:
             raise ValueError(f"column {name} of the saved replay {path} is damaged (checksum)")
         rows[name] = column
     return rows

@@ -44,6 +44,19 @@ def make_vector_env(spec: EnvSpec, num_envs: int) -> gym.vector.VectorEnv[Any, A
     return env
 
 
+def reset_seeded(env: gym.vector.VectorEnv[Any, Any, Any], seeds: list[int]) -> NDArray[Any]:
+    """First observations `[num_envs, ...]` of new episodes, environment i from `seeds[i]`."""
+    observation: NDArray[Any] = env.reset(seed=seeds)[0]  # type: ignore[arg-type]  # every VectorEnv takes a list
+    return observation
+
+
+def spaces_of(env: gym.vector.VectorEnv[Any, Any, Any]) -> EnvShape:
+    """The spaces of environments that `make_vector_env` made."""
+    space, actions = env.single_observation_space, env.single_action_space
+    assert isinstance(space, gym.spaces.Box) and isinstance(actions, gym.spaces.Discrete)
+    return EnvShape(space, int(actions.n))
+
+
 def _check_spaces(env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> None:
     if not isinstance(env.single_observation_space, gym.spaces.Box):
         raise ConfigError(f"env_id {env_id!r} must have Box observations, not {env.single_observation_space}")
@@ -68,9 +81,7 @@ def env_shape(spec: EnvSpec) -> EnvShape:
     """The spaces of `spec`, found by making one environment."""
     env = make_vector_env(spec, 1)
     try:
-        space, actions = env.single_observation_space, env.single_action_space
-        assert isinstance(space, gym.spaces.Box) and isinstance(actions, gym.spaces.Discrete)
-        return EnvShape(space, int(actions.n))
+        return spaces_of(env)
     finally:
         env.close()
 

@@ -47,9 +47,12 @@ def _on_setup(config: RunConfig, robots: int | None, groups: int | None) -> RunC
     if robots is None and groups is None:
         return config
     require(config.env.is_swarm, f"--robots and --groups apply to our own environment, not to {config.env_id}")
-    changes = {"robots": robots, "groups": groups}
-    given = {name: value for name, value in changes.items() if value is not None}
-    return dataclasses.replace(config, world=dataclasses.replace(config.world, **given))
+    world = dataclasses.replace(
+        config.world,
+        robots=config.world.robots if robots is None else robots,
+        groups=config.world.groups if groups is None else groups,
+    )
+    return dataclasses.replace(config, world=world)
 
 
 def watch(command: Watch) -> int:

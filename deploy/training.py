@@ -87,7 +87,8 @@ def _extended(config: RunConfig, total_env_steps: int | None, done: int) -> RunC
         config = dataclasses.replace(config, total_env_steps=total_env_steps)
     require(
         done < config.total_env_steps,
-        f"the run has finished its {config.total_env_steps} env steps; train on with --total-env-steps greater than {done}",
+        f"the run has finished its {config.total_env_steps} env steps; "
+        f"train on with --total-env-steps greater than {done}",
     )
     return config
 

@@ -1,0 +1,1 @@
+"""What runs once: update, pacing, checkpoints, tracking and the training loop."""

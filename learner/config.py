@@ -165,8 +165,8 @@ def _check_choices(config: RunConfig) -> None:
 def _check_pairs(config: RunConfig) -> None:
     require(
         config.replay_capacity >= config.replay_shards * config.block_env_steps,
-        f"replay_capacity ({config.replay_capacity}) must hold a block of {config.block_env_steps} transitions in each of "
-        f"{config.replay_shards} shards",
+        f"replay_capacity ({config.replay_capacity}) must hold a block of {config.block_env_steps} transitions "
+        f"in each of {config.replay_shards} shards",
     )
     require(
         config.min_replay <= config.replay_capacity,
@@ -174,7 +174,8 @@ def _check_pairs(config: RunConfig) -> None:
     )
     require(
         config.min_replay < config.total_env_steps,
-        f"min_replay ({config.min_replay}) must be below total_env_steps ({config.total_env_steps}), or nothing is learned",
+        f"min_replay ({config.min_replay}) must be below total_env_steps ({config.total_env_steps}), "
+        "or nothing is learned",
     )
 
 

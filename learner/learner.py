@@ -69,7 +69,7 @@ class Learner:
         q_tm1 = self.online(batch.s_tm1)
         loss, td_error = huber_loss(q_tm1, batch.a_tm1, target)
         self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(self.online.parameters(), self._settings.max_gradient_norm)
         self.optimiser.step()
         self.updates += 1

@@ -47,7 +47,7 @@ class Pending(NamedTuple):
     """A call under way: its kind, and what is needed to take its result."""
 
     kind: str
-    index: int
+    worker_id: int
     amount: int
 
 
@@ -163,7 +163,7 @@ class TrainingLoop:
             pending = self._pending.pop(ref)
             result = self._calls.get(ref)
             if pending.kind == "collect":
-                self._collects[pending.index] -= 1
+                self._collects[pending.worker_id] -= 1
                 self._take_blocks(result)
             elif pending.kind == "update":
                 self._take_updates(result, pending.amount)

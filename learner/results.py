@@ -60,7 +60,9 @@ def summarise(stats: EpisodeStats) -> Evaluation:
     if total == 0:
         raise ValueError("no episodes to summarise")
     named = bool((stats.outcome != NO_OUTCOME).all())
-    rates = {kind: rate(int((stats.outcome == kind).sum()), total) for kind in ENDED} if named else {}
+    rates: dict[Outcome, Estimate] = {}
+    if named:
+        rates = {kind: rate(int((stats.outcome == kind).sum()), total) for kind in ENDED}
     return Evaluation(total, rates, mean(stats.episode_return), mean(stats.length_steps))
 
 

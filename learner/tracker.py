@@ -38,7 +38,7 @@ CONNECT_TIMEOUT_S = 5.0
 def flat_params(config: RunConfig) -> dict[str, Any]:
     """The whole config as flat names; the world's fields and the run's have no name in common."""
     values = dataclasses.asdict(config)
-    world = values.pop("world")
+    world: dict[str, Any] = values.pop("world")
     return values | world
 
 
@@ -52,8 +52,8 @@ def check_reachable(uri: str) -> None:
         socket.create_connection((parts.hostname or "", port), CONNECT_TIMEOUT_S).close()
     except OSError as error:
         raise ConfigError(
-            f"no MLflow server answers at {uri} ({error}); start one with `mlflow server`, or leave --tracking-uri out to "
-            "log to a local file"
+            f"no MLflow server answers at {uri} ({error}); start one with `mlflow server`, "
+            "or leave --tracking-uri out to log to a local file"
         ) from error
 
 

@@ -186,11 +186,13 @@ def _check_lengths(config: WorldConfig) -> None:
         require(0 < getattr(config, name) <= 180, f"{name} must be in (0, 180], not {getattr(config, name)}")
     require(
         config.inner_radius_m < config.outer_radius_m,
-        f"inner_radius_m (R1 = {config.inner_radius_m}) must be smaller than outer_radius_m (R2 = {config.outer_radius_m})",
+        f"inner_radius_m (R1 = {config.inner_radius_m}) must be smaller than "
+        f"outer_radius_m (R2 = {config.outer_radius_m})",
     )
     require(
         config.orca_radius_m >= config.robot_radius_m,
-        f"orca_radius_m ({config.orca_radius_m}) must be at least robot_radius_m ({config.robot_radius_m}), or ORCA steers into collisions",
+        f"orca_radius_m ({config.orca_radius_m}) must be at least robot_radius_m ({config.robot_radius_m}), "
+        "or ORCA steers into collisions",
     )
     step_m = config.time_step_s * max(config.max_speed_m_s, config.learner_speed_m_s)
     require(
@@ -218,13 +220,13 @@ def _check_start_room(config: WorldConfig) -> None:
     require(
         math.hypot(config.start_spacing_m + 2 * config.start_jitter_m, 2 * config.start_jitter_m)
         < config.outer_radius_m,
-        f"the learning robot could start lost: its next robot, start_spacing_m ({config.start_spacing_m}) away and each "
-        f"shifted by start_jitter_m, must be nearer than outer_radius_m (R2 = {config.outer_radius_m})",
+        f"the learning robot could start lost: its next robot, start_spacing_m ({config.start_spacing_m}) away "
+        f"and each shifted by start_jitter_m, must be nearer than outer_radius_m (R2 = {config.outer_radius_m})",
     )
     room_m = 2 * config.arena_radius_m * math.sin(math.pi / config.groups) if config.groups > 1 else math.inf
     need_m = 2 * (start_grid_radius_m(config) + config.robot_radius_m)
     require(
         room_m >= need_m,
-        f"{config.setup} does not fit: neighbouring start grids need {need_m:.2f} m but their centres are {room_m:.2f} m apart; "
-        f"raise arena_radius_m or lower robots or groups",
+        f"{config.setup} does not fit: neighbouring start grids need {need_m:.2f} m "
+        f"but their centres are {room_m:.2f} m apart; raise arena_radius_m or lower robots or groups",
     )

@@ -117,7 +117,7 @@ class SwarmEnv(gym.Env[NDArray[Any], np.int64]):
         truncated = outcome == Outcome.TIMEOUT
         return result.observation[0], float(result.reward[0]), terminated, truncated, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """The world as `[height, width, 3]` uint8 in mode `rgb_array`, else None."""
         return _draw(self.worlds, 0) if self.render_mode == "rgb_array" else None
 
@@ -198,7 +198,7 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
             observation = self.worlds.reset(done)
         return observation, result.reward.astype(np.float64), terminated, done & ~terminated, infos
 
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One image `[height, width, 3]` uint8 a world in mode `rgb_array`, else None."""
         if self.render_mode != "rgb_array":
             return None

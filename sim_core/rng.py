@@ -31,4 +31,4 @@ def uniform(state, world):
 
 def world_streams(seed: int, num_worlds: int) -> NDArray[np.uint64]:
     """Independent initial states `[num_worlds]` uint64 for worlds of one batch."""
-    return np.random.SeedSequence(seed).generate_state(num_worlds, dtype=np.uint64)
+    return np.random.SeedSequence(seed).generate_state(num_worlds, dtype=np.uint64).astype(np.uint64)

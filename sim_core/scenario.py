@@ -8,7 +8,7 @@ learning robot. Everything is drawn from the world's own random stream.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from sim_core.config import WorldConfig
 from sim_core.jit import kernel
@@ -33,7 +33,7 @@ def scenario_params(config: WorldConfig) -> ScenarioParams:
 
 
 @kernel
-def start_world(world, pos_x, pos_y, vel_x, vel_y, goal_x, goal_y, learner, rng, s: Any):
+def start_world(world, pos_x, pos_y, vel_x, vel_y, goal_x, goal_y, learner, rng, s):
     """Writes a fresh start of one world.
 
     Args:

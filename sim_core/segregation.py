@@ -23,7 +23,8 @@ def mean_pairwise_distances_m(pos: NDArray[np.floating], groups: int) -> NDArray
     distance = np.sqrt((delta**2).sum(-1))
     size = points.shape[-2] // groups
     blocks = distance.reshape(*distance.shape[:-2], groups, size, groups, size)
-    return blocks.mean(axis=(-3, -1))
+    means: NDArray[np.float64] = blocks.mean(axis=(-3, -1))
+    return means
 
 
 def segregated_fraction(pos: NDArray[np.floating], groups: int) -> NDArray[np.float64]:
@@ -42,7 +43,8 @@ def segregated_fraction(pos: NDArray[np.floating], groups: int) -> NDArray[np.fl
     own = np.diagonal(mean, axis1=-2, axis2=-1)
     apart = (own[..., :, None] < mean) & (own[..., None, :] < mean)
     first, second = np.triu_indices(groups, 1)
-    return apart[..., first, second].mean(-1)
+    share: NDArray[np.float64] = apart[..., first, second].mean(-1)
+    return share
 
 
 def mean_goal_distance_m(pos: NDArray[np.floating], goal: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -58,4 +60,6 @@ def mean_goal_distance_m(pos: NDArray[np.floating], goal: NDArray[np.floating]) 
     points = np.asarray(pos, np.float64)
     groups = goal.shape[-2]
     by_group = points.reshape(*points.shape[:-2], groups, -1, 2)
-    return np.sqrt(((by_group - np.asarray(goal, np.float64)[..., :, None, :]) ** 2).sum(-1)).mean(-1)
+    distance = np.sqrt(((by_group - np.asarray(goal, np.float64)[..., :, None, :]) ** 2).sum(-1))
+    means: NDArray[np.float64] = distance.mean(-1)
+    return means

@@ -132,9 +132,9 @@ class WorldBatch:
 
 def is_done(outcome: NDArray[np.int8]) -> NDArray[np.bool_]:
     """Where an episode has ended."""
-    return outcome != Outcome.RUNNING
+    return np.not_equal(outcome, int(Outcome.RUNNING))
 
 
 def is_terminated(outcome: NDArray[np.int8]) -> NDArray[np.bool_]:
     """Where an episode has ended for a reason of the task, not of the clock."""
-    return is_done(outcome) & (outcome != Outcome.TIMEOUT)
+    return is_done(outcome) & np.not_equal(outcome, int(Outcome.TIMEOUT))
