@@ -41,7 +41,6 @@ def learner_settings(config: RunConfig, shape: EnvShape) -> LearnerSettings:
         num_actions=shape.num_actions,
         hidden_sizes=config.hidden_sizes,
         double=config.algorithm == "double_dqn",
-        learning_rate=config.learning_rate,
         batch_size=config.batch_size,
         target_update_interval=config.target_update_interval,
         max_gradient_norm=config.max_gradient_norm,

@@ -30,7 +30,7 @@ class RunConfig:
     """Seed of every random stream of the run."""
     engine: Literal["ray", "process"] = "ray"
     """Ray actors, or everything in one process (deterministic, for tests and debugging)."""
-    total_env_steps: int = 4_000_000
+    total_env_steps: int = 3_000_000
     """Env steps to train for, over all workers."""
 
     workers: int = 1
@@ -76,7 +76,11 @@ class RunConfig:
     updates_per_call: int = 32
     """Updates between two publications of the weights."""
     learning_rate: float = 1e-3
-    """Adam's learning rate (the text's lambda)."""
+    """Adam's learning rate at the start (the text's lambda)."""
+    learning_rate_end: float = 1e-4
+    """Adam's learning rate after the decay."""
+    learning_rate_decay_env_steps: int = 3_000_000
+    """Env steps over which the learning rate falls linearly."""
     target_update_interval: int = 500
     """Updates between two copies of the online to the target network (C)."""
     max_gradient_norm: float = 10.0
@@ -117,6 +121,11 @@ class RunConfig:
             self.ladder_exponent,
         )
 
+    def learning_rate_at(self, env_steps: int) -> float:
+        """Adam's learning rate after `env_steps` env steps: a function of a counter that checkpoints hold."""
+        done = min(1.0, env_steps / self.learning_rate_decay_env_steps)
+        return self.learning_rate + done * (self.learning_rate_end - self.learning_rate)
+
     @property
     def block_env_steps(self) -> int:
         """Env steps of one block."""
@@ -124,7 +133,7 @@ class RunConfig:
 
 
 AT_LEAST_ONE = (
-    "total_env_steps workers envs_per_worker steps_per_block epsilon_decay_env_steps replay_shards replay_capacity "
+    "total_env_steps workers envs_per_worker steps_per_block epsilon_decay_env_steps learning_rate_decay_env_steps replay_shards replay_capacity "
     "min_replay n_step batch_size updates_per_call target_update_interval eval_every_env_steps eval_episodes "
     "final_eval_episodes log_every_env_steps checkpoint_every_env_steps keep_checkpoints"
 ).split()
@@ -146,7 +155,7 @@ def _check_ranges(config: RunConfig) -> None:
     for name in ("epsilon_start", "epsilon_end", "ladder_base"):
         require(0 <= getattr(config, name) <= 1, f"{name} must be between 0 and 1, not {getattr(config, name)}")
     require(0 < config.discount <= 1, f"discount must be in (0, 1], not {config.discount}")
-    for name in ("samples_per_insert", "learning_rate", "max_gradient_norm"):
+    for name in ("samples_per_insert", "learning_rate", "learning_rate_end", "max_gradient_norm"):
         require(getattr(config, name) > 0, f"{name} must be greater than 0, not {getattr(config, name)}")
     require(config.ladder_exponent >= 0, f"ladder_exponent must not be negative, not {config.ladder_exponent}")
     sizes = config.hidden_sizes

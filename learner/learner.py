@@ -21,7 +21,6 @@ class LearnerSettings(NamedTuple):
     num_actions: int
     hidden_sizes: tuple[int, ...]
     double: bool
-    learning_rate: float
     batch_size: int
     target_update_interval: int
     max_gradient_norm: float
@@ -49,11 +48,13 @@ class Learner:
             torch.manual_seed(settings.seed)
             self.online = QNetwork(settings.observation_size, settings.hidden_sizes, settings.num_actions)
         self.target = copy.deepcopy(self.online)
-        self.optimiser = torch.optim.Adam(self.online.parameters(), lr=settings.learning_rate, fused=True)
+        self.optimiser = torch.optim.Adam(self.online.parameters(), fused=True)
         self.updates = 0
 
-    def update(self, rows: NDArray[Any]) -> UpdateStats:
+    def update(self, rows: NDArray[Any], learning_rate: float) -> UpdateStats:
         """One update per `batch_size` rows of `rows`, a whole multiple of it."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate
         columns = _tensors(rows)
         size = self._settings.batch_size
         sums = torch.zeros(3)

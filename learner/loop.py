@@ -145,7 +145,8 @@ class TrainingLoop:
             if not updates:
                 return
             self._pacer.sampling(updates)
-            self._add(self._calls.start(self._cluster.learner, "update", updates), Pending("update", 0, updates))
+            rate = self._config.learning_rate_at(self.env_steps)
+            self._add(self._calls.start(self._cluster.learner, "update", updates, rate), Pending("update", 0, updates))
             under_way += 1
 
     def _start_evaluation(self) -> None:

@@ -53,10 +53,10 @@ class LearnerNode:
         shard: ShardNode = self._shards[block.header.sequence % len(self._shards)]
         return shard.add(block)
 
-    def update(self, updates: int) -> UpdateReport:
+    def update(self, updates: int, learning_rate: float) -> UpdateReport:
         """Samples a super-batch, makes `updates` updates of it, and publishes the weights."""
         rows = self._sample(updates * self._settings.batch_size)
-        stats = self._learner.update(rows)
+        stats = self._learner.update(rows, learning_rate)
         return UpdateReport(stats, self._learner.updates, self.publish())
 
     def publish(self) -> list[Ref]:

@@ -1,0 +1,36 @@
+# `make train` and `make test` do all the set-up on a fresh machine; the rest builds on them.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: train test bench lint setup clean
+
+setup: $(READY)
+
+# The environment counts as made only once everything is in it.
+$(READY): pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "shoal needs Python 3.11 or newer: make PYTHON=python3.11 ...")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $(READY)
+
+# The main job: M_sensor, 10 robots x 2 groups, on a Ray of its own. ARGS adds flags, as in ARGS="--seed 1".
+train: $(READY)
+	$(BIN)/shoal train $(ARGS)
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
+
+# Lint, types, import rules, then all tests. ARGS goes to pytest.
+test: lint
+	$(BIN)/python -m pytest $(ARGS)
+
+bench: $(READY)
+	$(BIN)/python -m tests.benchmarks $(ARGS)
+
+clean:
+	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -1,0 +1,107 @@
+"""n-step transitions against a reference that looks at whole episodes of one environment."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from actors.nstep import NStepAssembler
+from actors.transitions import transition_dtype
+
+DTYPE = transition_dtype(gym.spaces.Box(-1e6, 1e6, (2,), np.float32))
+RUNS, TERMINATES, TRUNCATES = 0, 1, 2
+DISCOUNT = 0.9
+
+
+def reference(rewards, ends, n_step):
+    """Rows (start, action, return, discount, state reached) of one environment, oldest first."""
+    rows, start = [], 0
+    for stop in [*np.flatnonzero(ends) + 1, len(ends)]:
+        ended = stop > start and ends[stop - 1] != RUNS
+        for t in range(start, stop):
+            last = min(t + n_step, stop)
+            if last - t < n_step and not ended:
+                continue  # still waits for rewards
+            value = sum(DISCOUNT**k * rewards[t + k] for k in range(last - t))
+            terminal = last == stop and ends[stop - 1] == TERMINATES
+            rows.append((t, t % 7, value, 0.0 if terminal else DISCOUNT ** (last - t), last))
+        start = stop
+    return rows
+
+
+def push_all(assembler, rewards, ends, steps):
+    """Pushes env steps `steps` of `rewards`, `ends` `[steps, num_envs]`; all rows in the order they came."""
+    rows = [np.zeros(0, DTYPE)]
+    envs = np.arange(rewards.shape[1])
+    for t in steps:
+        seen = np.stack([envs, np.full_like(envs, t)], axis=1).astype(np.float32)
+        reached = seen + np.array([0, 1], np.float32)
+        rows += assembler.push(
+            seen, np.full(len(envs), t % 7), rewards[t], reached, ends[t] == TERMINATES, ends[t] != RUNS
+        )
+    return np.concatenate(rows)
+
+
+def of_env(rows, env):
+    """Rows of one environment in order, as the reference lists them."""
+    mine = rows[rows["observation"][:, 0] == env]
+    assert (mine["next_observation"][:, 0] == env).all()
+    columns = (mine["observation"][:, 1], mine["action"], mine["reward"], mine["discount"])
+    return np.column_stack([*columns, mine["next_observation"][:, 1]])
+
+
+@st.composite
+def histories(draw):
+    num_envs, steps = draw(st.integers(1, 3)), draw(st.integers(1, 14))
+    flags = st.lists(st.sampled_from([RUNS, RUNS, TERMINATES, TRUNCATES]), min_size=steps, max_size=steps)
+    ends = np.array([draw(flags) for _ in range(num_envs)]).T
+    rewards = np.random.default_rng(draw(st.integers(0, 99))).normal(size=ends.shape)
+    return rewards, ends
+
+
+@given(history=histories(), n_step=st.integers(1, 5))
+@settings(max_examples=200, deadline=None)
+def test_equals_the_reference_per_environment_and_in_order(history, n_step):
+    rewards, ends = history
+    assembler = NStepAssembler(DTYPE, rewards.shape[1], n_step, DISCOUNT)
+    rows = push_all(assembler, rewards, ends, range(len(rewards)))
+    expected = [reference(rewards[:, env], ends[:, env], n_step) for env in range(rewards.shape[1])]
+    assert len(rows) == sum(map(len, expected))
+    for env, wanted in enumerate(expected):
+        np.testing.assert_allclose(of_env(rows, env), np.reshape(wanted, (-1, 5)), rtol=1e-5, atol=1e-6)
+
+
+@given(history=histories(), n_step=st.integers(1, 5), data=st.data())
+@settings(max_examples=60, deadline=None)
+def test_a_saved_state_goes_on_where_it_was(history, n_step, data):
+    rewards, ends = history
+    cut = data.draw(st.integers(0, len(rewards)))
+    whole = NStepAssembler(DTYPE, rewards.shape[1], n_step, DISCOUNT)
+    push_all(whole, rewards, ends, range(cut))
+    saved = whole.get_state()
+    resumed = NStepAssembler(DTYPE, rewards.shape[1], n_step, DISCOUNT)
+    push_all(resumed, rewards + 5, ends, range(min(2, len(rewards))))  # what it held before must not matter
+    expected = push_all(whole, rewards, ends, range(cut, len(rewards)))  # must not change what was saved
+    resumed.set_state(saved)
+    np.testing.assert_array_equal(push_all(resumed, rewards, ends, range(cut, len(rewards))), expected)
+
+
+@pytest.mark.parametrize(
+    ("end", "discounts"), [(TERMINATES, [0, 0, 0]), (TRUNCATES, [0.9**3, 0.9**2, 0.9]), (RUNS, [0.9**3])]
+)
+def test_termination_counts_no_future_and_truncation_does(end, discounts):
+    rewards, ends = np.array([[1.0], [2.0], [4.0]]), np.array([[RUNS], [RUNS], [end]])
+    rows = push_all(NStepAssembler(DTYPE, 1, 3, DISCOUNT), rewards, ends, range(3))
+    np.testing.assert_allclose(rows["discount"], discounts, rtol=1e-6)
+    returns = [1 + 0.9 * 2 + 0.81 * 4, 2 + 0.9 * 4, 4.0]
+    np.testing.assert_allclose(rows["reward"], returns[: len(rows)], rtol=1e-6)
+
+
+def test_clear_forgets_waiting_steps():
+    rewards, ends = np.ones((4, 2)), np.zeros((4, 2), int)
+    assembler = NStepAssembler(DTYPE, 2, 3, DISCOUNT)
+    push_all(assembler, rewards, ends, range(2))
+    assembler.clear()
+    rows = push_all(assembler, rewards, ends, range(2, 4))
+    assert len(rows) == 0

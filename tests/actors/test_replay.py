@@ -1,0 +1,168 @@
+"""The ring of a replay shard against a deque, and what it keeps out."""
+
+import json
+from collections import deque
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from actors.replay import ReplayShard, Stored
+from actors.rollout import join_stats
+from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
+
+DTYPE = transition_dtype(gym.spaces.Box(-127, 127, (2, 3), np.int8))
+
+
+def make_block(numbers, sequence=0, worker_id=0, incarnation=0, schema=SCHEMA_VERSION, dtype=DTYPE):
+    """A block of rows that carry `numbers` in several columns."""
+    rows = np.zeros(len(numbers), dtype)
+    rows["reward"] = rows["action"] = numbers
+    rows["next_observation"] = (np.asarray(numbers) % 100)[:, None, None]
+    header = BlockHeader(schema, worker_id, incarnation, sequence, 0, 0.0, 0.0, len(numbers))
+    return TransitionBlock(header, rows, join_stats([]))
+
+
+def held(shard):
+    """Numbers that can be drawn; misses one of 12 with probability 1e-22."""
+    rows = shard.sample(600).rows
+    np.testing.assert_array_equal(rows["reward"], rows["action"])
+    np.testing.assert_array_equal(rows["next_observation"], np.tile((rows["action"] % 100)[:, None, None], (1, 2, 3)))
+    return set(rows["action"].tolist())
+
+
+@given(capacity=st.integers(1, 12), lengths=st.lists(st.integers(0, 30), min_size=1, max_size=12))
+@settings(max_examples=80, deadline=None)
+def test_holds_the_newest_rows_like_a_deque(capacity, lengths):
+    shard, oracle, total = ReplayShard(DTYPE, capacity, 0), deque(maxlen=capacity), 0
+    for sequence, length in enumerate(lengths):
+        numbers = list(range(total, total + length))
+        assert shard.add(make_block(numbers, sequence)) == Stored(length, False)
+        oracle.extend(numbers)
+        total += length
+        assert (shard.size, shard.inserted) == (len(oracle), total)
+        if oracle:
+            assert held(shard) == set(oracle)
+
+
+def test_an_empty_shard_cannot_be_sampled():
+    with pytest.raises(ValueError, match="empty"):
+        ReplayShard(DTYPE, 4, 0).sample(1)
+
+
+@pytest.mark.parametrize(("incarnation", "sequence"), [(1, 5), (1, 4), (0, 6), (0, 99)])
+def test_repeated_late_and_outdated_blocks_are_dropped(incarnation, sequence):
+    shard = ReplayShard(DTYPE, 100, 0)
+    shard.add(make_block([1, 2], sequence=5, incarnation=1))
+    again = make_block([3, 4, 5], sequence=sequence, incarnation=incarnation)
+    assert shard.add(again) == Stored(0, True)
+    assert (shard.size, shard.inserted, shard.dropped) == (2, 2, 3)
+    assert held(shard) == {1, 2}
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"incarnation": 1, "sequence": 6},
+        {"incarnation": 1, "sequence": 9},  # the numbers between went to other shards
+        {"incarnation": 2, "sequence": 0},  # a restarted worker counts from 0
+        {"incarnation": 0, "sequence": 0, "worker_id": 7},
+    ],
+)
+def test_new_blocks_are_stored(header):
+    shard = ReplayShard(DTYPE, 100, 0)
+    shard.add(make_block([1, 2], sequence=5, incarnation=1))
+    assert shard.add(make_block([3], **header)) == Stored(1, False)
+    assert held(shard) == {1, 2, 3} and shard.dropped == 0
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"schema": SCHEMA_VERSION + 1},
+        {"schema": SCHEMA_VERSION - 1},
+        {"dtype": transition_dtype(gym.spaces.Box(-127, 127, (3, 2), np.int8))},
+        {"dtype": transition_dtype(gym.spaces.Box(-127, 127, (2, 3), np.float32))},
+    ],
+)
+def test_another_schema_is_refused_and_may_be_sent_again(other):
+    shard = ReplayShard(DTYPE, 10, 0)
+    with pytest.raises(ValueError, match="schema"):
+        shard.add(make_block([1], **other))
+    assert (shard.size, shard.inserted, shard.dropped) == (0, 0, 0)
+    assert shard.add(make_block([1])) == Stored(1, False)
+
+
+@pytest.mark.parametrize("inserted", [20, 40, 55])
+def test_every_row_is_drawn_equally_often(inserted):
+    shard = ReplayShard(DTYPE, 40, 3)
+    shard.add(make_block(range(inserted)))
+    counts = np.bincount(shard.sample(40_000).rows["action"], minlength=inserted)
+    oldest = max(0, inserted - 40)
+    assert not counts[:oldest].any()
+    assert stats.chisquare(counts[oldest:]).pvalue > 1e-4
+
+
+def test_draws_are_independent_and_with_replacement():
+    shard = ReplayShard(DTYPE, 4, 1)
+    shard.add(make_block(range(4)))
+    drawn = shard.sample(20_000).rows["action"]
+    pairs = np.bincount(4 * drawn[:-1:2] + drawn[1::2], minlength=16)
+    assert stats.chisquare(pairs).pvalue > 1e-4
+
+
+def test_samples_are_copies():
+    shard = ReplayShard(DTYPE, 4, 1)
+    shard.add(make_block([7, 7, 7, 7]))
+    reply = shard.sample(8)
+    assert reply.size == 4
+    reply.rows["action"] = 0
+    reply.rows["reward"] = 0
+    assert held(shard) == {7}
+
+
+def filled(tmp_path, capacity=16):
+    """A shard that has wrapped, dropped and sampled; and its save."""
+    shard = ReplayShard(DTYPE, capacity, 11)
+    shard.add(make_block(range(21), sequence=3, worker_id=2))
+    shard.add(make_block(range(100, 103), sequence=0, worker_id=5, incarnation=4))
+    shard.add(make_block(range(8), sequence=3, worker_id=2))
+    shard.sample(5)
+    return shard, json.loads(json.dumps(shard.save(tmp_path / "shard.zarr")))
+
+
+def test_a_saved_shard_goes_on_where_it_was(tmp_path):
+    shard, state = filled(tmp_path)
+    resumed = ReplayShard(DTYPE, 16, 999)
+    resumed.add(make_block(range(500, 516)))
+    resumed.load(tmp_path / "shard.zarr", state)
+    assert (resumed.size, resumed.inserted, resumed.dropped) == (16, 24, 8)
+    np.testing.assert_array_equal(resumed.sample(50).rows, shard.sample(50).rows)
+    for copy in (shard, resumed):
+        assert copy.add(make_block([1], sequence=3, worker_id=2)).duplicate
+        assert not copy.add(make_block(range(200, 205), sequence=4, worker_id=2)).duplicate
+    np.testing.assert_array_equal(resumed.sample(50).rows, shard.sample(50).rows)
+    assert held(resumed) == held(shard) == {*range(13, 21), *range(100, 103), *range(200, 205)}
+
+
+def test_an_empty_shard_can_be_saved(tmp_path):
+    state = ReplayShard(DTYPE, 8, 0).save(tmp_path / "shard.zarr")
+    resumed = ReplayShard(DTYPE, 8, 0)
+    resumed.load(tmp_path / "shard.zarr", state)
+    assert resumed.size == 0
+
+
+@pytest.mark.parametrize("capacity", [15, 17, 64])
+def test_a_full_ring_is_refused_by_another_capacity(tmp_path, capacity):
+    _, state = filled(tmp_path)
+    with pytest.raises(ValueError, match="shard.zarr"):
+        ReplayShard(DTYPE, capacity, 0).load(tmp_path / "shard.zarr", state)
+
+
+def test_state_of_another_save_is_refused(tmp_path):
+    _, state = filled(tmp_path)
+    with pytest.raises(ValueError, match="16 transitions"):
+        ReplayShard(DTYPE, 16, 0).load(tmp_path / "shard.zarr", {**state, "size": 15})

@@ -1,0 +1,180 @@
+"""Bad input on the command line: exit code 2, a sentence that says what and how to mend it, no traceback."""
+
+import json
+import shutil
+import socket
+from pathlib import Path
+
+import pytest
+
+from deploy.cli import main
+from tests.integration.conftest import SMALL, flags
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
+    try:
+        code = main(arguments)
+    except SystemExit as stop:  # tyro's way out
+        code = stop.code if isinstance(stop.code, int) else 1
+    return code, capsys.readouterr().err
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--robots", "0"], ["robots", "at least 2", "0"]),
+        (["--robots", "five"], ["--robots", "five"]),
+        (["--robts", "5"], ["--robts", "--robots"]),
+        (["--groups", "-1"], ["groups", "at least 1"]),
+        (["--inner-radius-m", "2"], ["inner_radius_m", "outer_radius_m", "smaller"]),
+        (["--time-step-s", "-0.05"], ["time_step_s", "greater than 0"]),
+        (["--time-step-s", "nan"], ["time_step_s", "finite"]),
+        (["--robots", "400", "--groups", "8"], ["does not fit", "arena_radius_m"]),
+        (["--start-spacing-m", "0.2"], ["overlap", "start_spacing_m"]),
+        (["--engine", "slurm"], ["--engine", "process"]),
+        (["--batch-size", "0"], ["batch_size", "at least 1"]),
+        (["--discount", "1.5"], ["discount", "(0, 1]"]),
+        (["--min-replay", "9999999"], ["min_replay", "replay_capacity"]),
+        (["--env-id", "NoSuchEnv-v0"], ["env_id", "NoSuchEnv"]),
+        (["--env-id", "Pendulum-v1"], ["env_id", "Discrete"]),
+        (["--name", "../up"], ["--name", "plain folder name"]),
+        (["--config", "missing.toml"], ["--config", "missing.toml", "cannot be read"]),
+        (["--runs-dir", "/proc/nothing"], ["--runs-dir", "write"]),
+    ],
+)
+def test_train_refuses(capsys, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    code, error = run(capsys, "train", *arguments)
+    assert code == 2
+    assert "Traceback" not in error
+    for word in words:
+        assert word in error
+    assert not list(tmp_path.iterdir()) or not list(tmp_path.glob("runs/*/config.json")), "nothing was started"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("learning_rat = 1e-3", ["unknown key", "learning_rat"]),
+        ("[world]\nrobot = 5", ["unknown key", "robot", "[world]"]),
+        ("batch_size = [", ["no valid TOML"]),
+        ("batch_size = 1.5", ["batch_size", "whole number"]),
+        ("[world]\nrobots = 'many'", ["robots", "whole number"]),
+        ("world = 3", ["world", "section"]),
+        ("learning_rate = 'fast'", ["learning_rate", "number"]),
+        ("hidden_sizes = 64", ["hidden_sizes"]),
+    ],
+)
+def test_train_refuses_a_config_file(capsys, tmp_path, monkeypatch, text, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.toml").write_text(text)
+    code, error = run(capsys, "train", "--config", "run.toml")
+    assert code == 2
+    assert "Traceback" not in error
+    for word in words:
+        assert word in error
+
+
+def test_a_config_file_gives_the_defaults_and_flags_override_them(tmp_path):
+    from deploy.cli import parse
+
+    (tmp_path / "run.toml").write_text("batch_size = 64\nhidden_sizes = [32, 16]\n[world]\nrobots = 5\ngroups = 3\n")
+    command = parse(["train", "--config", str(tmp_path / "run.toml"), "--robots", "7"])
+    assert (command.run.batch_size, command.run.hidden_sizes) == (64, (32, 16))
+    assert (command.run.world.robots, command.run.world.groups) == (7, 3)
+
+
+def test_an_unreachable_tracking_server_is_refused_at_the_start(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    uri = f"http://127.0.0.1:{free_port()}"
+    code, error = run(capsys, "train", "--tracking-uri", uri)
+    assert code == 2
+    assert uri in error
+    assert "mlflow server" in error
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The runs folder of one small finished run named `r`."""
+    runs = tmp_path_factory.mktemp("cli") / "runs"
+    assert main(["train", "--runs-dir", str(runs), "--name", "r", *flags(SMALL)]) == 0
+    return runs
+
+
+@pytest.fixture
+def runs(finished: Path, tmp_path: Path) -> Path:
+    """A copy that a test may damage."""
+    return Path(shutil.copytree(finished, tmp_path / "runs"))
+
+
+@pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:DeprecationWarning")  # MLflow's own query
+class TestWithARun:
+    def test_a_taken_name_is_refused(self, capsys, runs):
+        code, error = run(capsys, "train", "--runs-dir", str(runs), "--name", "r")
+        assert code == 2
+        assert "shoal resume r" in error
+
+    def test_an_unknown_run_is_refused(self, capsys, runs):
+        for command in ("resume", "evaluate", "watch"):
+            code, error = run(capsys, command, "nobody", "--runs-dir", str(runs))
+            assert code == 2
+            assert "nobody" in error
+            assert "runs there: r" in error
+
+    def test_a_finished_run_is_not_resumed_without_more_steps(self, capsys, runs):
+        code, error = run(capsys, "resume", "r", "--runs-dir", str(runs))
+        assert code == 2
+        assert "--total-env-steps" in error
+
+    def test_missing_checkpoints_are_refused(self, capsys, runs):
+        shutil.rmtree(runs / "r" / "checkpoints")
+        for command in ("resume", "evaluate", "watch"):
+            code, error = run(capsys, command, "r", "--runs-dir", str(runs))
+            assert code == 2
+            assert "no usable checkpoint" in error
+
+    def test_damaged_checkpoints_are_refused_by_name(self, capsys, runs):
+        for folder in (runs / "r" / "checkpoints").iterdir():
+            path = folder / "learner.safetensors"
+            data = bytearray(path.read_bytes())
+            data[len(data) // 2] ^= 1
+            path.write_bytes(data)
+        code, error = run(capsys, "evaluate", "r", "--runs-dir", str(runs))
+        assert code == 2
+        assert "damaged (learner.safetensors)" in error
+
+    def test_one_damaged_checkpoint_is_skipped_and_said(self, capsys, runs):
+        newest = max((runs / "r" / "checkpoints").iterdir())
+        (newest / "state.json").write_text("{}")
+        assert main(["watch", "r", "--runs-dir", str(runs)]) == 0
+        assert "skipped" in capsys.readouterr().err
+
+    def test_a_checkpoint_of_another_config_is_refused(self, capsys, runs):
+        path = runs / "r" / "config.json"
+        config = json.loads(path.read_text())
+        path.write_text(json.dumps(config | {"learning_rate": 0.5}))
+        code, error = run(capsys, "resume", "r", "--runs-dir", str(runs), "--total-env-steps", "9000")
+        assert code == 2
+        assert "another config" in error
+
+    def test_a_policy_of_another_shape_is_refused(self, capsys, runs):
+        path = runs / "r" / "config.json"
+        config = json.loads(path.read_text())
+        config["world"]["sectors"] = 12
+        path.write_text(json.dumps(config))
+        code, error = run(capsys, "watch", "r", "--runs-dir", str(runs))
+        assert code == 2
+        assert "sectors" in error
+
+    def test_watch_makes_page_and_video(self, runs, tmp_path):
+        page, video = tmp_path / "e.html", tmp_path / "e.mp4"
+        assert main(["watch", "r", "--runs-dir", str(runs), "--out", str(page)]) == 0
+        assert "<canvas" in page.read_text()
+        assert main(["watch", "r", "--runs-dir", str(runs), "--format", "mp4", "--out", str(video)]) == 0
+        assert video.read_bytes()[4:8] == b"ftyp"

@@ -1,0 +1,110 @@
+"""One process: a run is reproducible from its seed, and a resumed run is the uninterrupted one."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from safetensors.numpy import load_file
+
+from learner.checkpoint import newest_valid
+from learner.cluster import process_cluster
+from learner.journal import Journal
+from learner.loop import TrainingLoop
+from tests.integration.conftest import clean_environment, flags
+
+CLOCKED = ("speed/", "system/", "policy/staleness_s")
+"""Metrics that depend on the clock."""
+
+
+class Silent:
+    def row(self, row):
+        pass
+
+    def checkpoint(self, folder, journal_offset):
+        pass
+
+
+def train(config, folder: Path) -> None:
+    cluster = process_cluster(config, 0)
+    with closing(Journal(folder / "metrics.jsonl", 0)) as journal:
+        assert TrainingLoop(config, cluster, journal, folder / "checkpoints", Silent(), bool).run()
+
+
+def final_state(folder: Path):
+    """Weights, optimiser, replay, worlds, counters and metrics of a run's last checkpoint."""
+    checkpoint, skipped = newest_valid(folder / "checkpoints")
+    assert not skipped
+    arrays = {}
+    for path in sorted(checkpoint.folder.glob("*.safetensors")):
+        arrays |= {f"{path.stem}/{name}": array for name, array in load_file(path).items()}
+    for path in sorted(checkpoint.folder.glob("*.zarr")):
+        root = zarr.open_group(str(path), mode="r")
+        arrays |= {f"{path.stem}/{name}": np.asarray(array[...]) for name, array in root.arrays()}
+    state = checkpoint.state
+    for name in ("incarnation", "journal_offset", "meters"):
+        state.pop(name)
+    for worker in state["workers"]:
+        worker["policy"] = worker["policy"][0]
+    for shard in state["learner"]["shards"]:
+        shard["newest"] = [[worker, sequence] for worker, _, sequence in shard["newest"]]
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    metrics = [
+        (steps, {name: value for name, value in values.items() if not name.startswith(CLOCKED)})
+        for steps, _, values in rows
+    ]
+    return arrays, state, metrics
+
+
+def assert_same(one, two):
+    arrays_1, state_1, metrics_1 = one
+    arrays_2, state_2, metrics_2 = two
+    assert arrays_1.keys() == arrays_2.keys()
+    assert len(arrays_1) > 20
+    different = [name for name in arrays_1 if not np.array_equal(arrays_1[name], arrays_2[name])]
+    assert not different
+    assert state_1 == state_2
+    assert metrics_1 == metrics_2
+    assert len(metrics_1) >= 6
+
+
+def test_two_runs_of_a_seed_are_the_same_bit_for_bit(small, tmp_path):
+    train(small, tmp_path / "one")
+    train(small, tmp_path / "two")
+    assert_same(final_state(tmp_path / "one"), final_state(tmp_path / "two"))
+
+
+def test_another_seed_is_another_run(small, tmp_path):
+    train(small, tmp_path / "one")
+    train(dataclasses.replace(small, seed=1), tmp_path / "two")
+    one, two = final_state(tmp_path / "one")[0], final_state(tmp_path / "two")[0]
+    assert not np.array_equal(one["learner/online.layers.0.weight"], two["learner/online.layers.0.weight"])
+
+
+@pytest.mark.parametrize("shards", [1, 3])
+def test_a_run_resumed_in_a_new_process_is_the_uninterrupted_one(small, tmp_path, shards):
+    whole = dataclasses.replace(small, replay_shards=shards, workers=2, replay_capacity=4_200)
+    half = dataclasses.replace(whole, total_env_steps=3_072)
+    train(whole, tmp_path / "whole")
+
+    def run(*arguments):
+        done = subprocess.run(
+            [sys.executable, "-m", "deploy", *arguments],
+            cwd=tmp_path,
+            env=clean_environment(),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+
+    run("train", "--name", "halves", *flags(half))
+    run("resume", "halves", "--total-env-steps", str(whole.total_env_steps))
+    halves = final_state(tmp_path / "runs" / "halves")
+    assert halves[1]["env_steps"] >= 2 * 3_000
+    assert_same(final_state(tmp_path / "whole"), halves)

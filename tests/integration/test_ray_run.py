@@ -1,0 +1,167 @@
+"""Over Ray: a run trains, survives being killed and interrupted, and leaves a whole history in MLflow."""
+
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import mlflow
+import psutil
+import pytest
+from safetensors.numpy import load_file
+
+from learner.checkpoint import newest_valid
+from learner.config import to_dict
+from learner.tracker import flat_params
+from tests.integration.conftest import SMALL, clean_environment, flags
+
+pytestmark = [
+    pytest.mark.ray,
+    pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:DeprecationWarning"),  # MLflow's own query
+]
+
+LONG = dataclasses.replace(SMALL, engine="ray", total_env_steps=400_000, checkpoint_every_env_steps=4_000)
+
+
+class Job:
+    """`shoal` in the background, in an empty folder."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self.folder = folder
+        self.log = folder / "job.log"
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "deploy", *arguments],
+                cwd=folder,
+                env=clean_environment(),
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
+
+    def wait_for_checkpoints(self, run: str, count: int) -> None:
+        root = self.folder / "runs" / run / "checkpoints"
+        seen: set[str] = set()
+        deadline_s = time.monotonic() + 120
+        while len(seen) < count:
+            assert self.process.poll() is None, self.log.read_text()
+            assert time.monotonic() < deadline_s, self.log.read_text()
+            seen |= {path.name for path in root.glob("step-*") if path.suffix != ".part"}
+            time.sleep(0.05)
+
+    def kill_all(self) -> None:
+        """SIGKILL for the driver and every process that it started."""
+        driver = psutil.Process(self.process.pid)
+        family = [driver, *driver.children(recursive=True)]
+        assert len(family) > 3, "Ray runs in processes of its own"
+        for process in family:
+            process.kill()
+        psutil.wait_procs(family, timeout=30)
+        self.process.wait(30)
+
+
+def the_run(folder: Path):
+    client = mlflow.MlflowClient(f"sqlite:///{folder}/runs/mlflow.db")
+    runs = client.search_runs([client.get_experiment_by_name("shoal").experiment_id])
+    assert len(runs) == 1, "a resumed run is the same MLflow run"
+    return client, runs[0]
+
+
+def assert_history_is_the_journal(folder: Path, run: str) -> None:
+    """Every journal row is in MLflow once, and nothing else is."""
+    client, found = the_run(folder)
+    rows = [json.loads(line) for line in (folder / "runs" / run / "metrics.jsonl").read_text().splitlines()]
+    for key in ("train/epsilon", "replay/size", "eval/success_rate"):
+        expected = [(steps, values[key]) for steps, _, values in rows if key in values]
+        history = [(metric.step, metric.value) for metric in client.get_metric_history(found.info.run_id, key)]
+        assert Counter(history) == Counter(expected)
+        assert len({steps for steps, _ in history}) == len(history), "a step stands twice"
+        assert len(history) >= 2
+
+
+def test_a_run_over_ray_leaves_everything_a_user_compares(shoal, tmp_path):
+    config = dataclasses.replace(SMALL, engine="ray", workers=2, replay_shards=2, replay_placement="actors")
+    done = shoal("train", "--name", "r", *flags(config))
+    assert done.returncode == 0, done.stderr
+    for word in ("success rate", "MLflow UI", "checkpoint", "curve", "animation"):
+        assert word in done.stdout
+    client, run = the_run(tmp_path)
+    assert run.info.status == "FINISHED"
+    assert run.info.run_name == "sensor 3r×2g s0"
+    assert run.data.params == {key: str(value) for key, value in flat_params(config).items()}
+    tags = {name: run.data.tags[name] for name in ("method", "robots", "groups", "seed", "engine")}
+    assert tags == {"method": "sensor", "robots": "3", "groups": "2", "seed": "0", "engine": "ray"}
+    assert len(run.data.tags["mlflow.source.git.commit"]) in (40, len("unknown"))
+    assert len(run.data.metrics) <= 45
+    for key in ("final/success_rate_low", "train/q_mean", "train/td_error", "policy/staleness_updates", "replay/size"):
+        assert key in run.data.metrics
+    artifacts = {item.path for item in client.list_artifacts(run.info.run_id)}
+    assert artifacts == {"config.json", "learning_curve.png", "episode.html", "episode.zarr"}
+    models = client.search_logged_models([run.info.experiment_id])
+    assert [model.source_run_id for model in models] == [run.info.run_id]
+    assert_history_is_the_journal(tmp_path, "r")
+    assert json.loads((tmp_path / "runs/r/config.json").read_text()) == json.loads(json.dumps(to_dict(config)))
+
+
+def test_every_transition_is_accounted_for(shoal, tmp_path):
+    config = dataclasses.replace(SMALL, engine="ray", workers=2, replay_shards=2, replay_placement="actors")
+    done = shoal("train", "--name", "r", *flags(config))
+    assert done.returncode == 0, done.stderr
+    checkpoint, _ = newest_valid(tmp_path / "runs/r/checkpoints")
+    state = checkpoint.state
+    shards = state["learner"]["shards"]
+    waiting = [load_file(checkpoint.folder / f"worker-{i}.safetensors")["nstep_count"].sum() for i in range(2)]
+    assert sum(shard["inserted"] for shard in shards) == state["pacing"]["inserted"]
+    assert state["pacing"]["inserted"] + sum(waiting) == state["env_steps"]
+    assert all(shard["inserted"] > 0 and shard["dropped"] == 0 for shard in shards)
+    assert state["pacing"]["sampled"] == state["updates"] * config.batch_size
+    ahead = state["pacing"]["inserted"] * config.samples_per_insert - state["pacing"]["sampled"]
+    band = 2 * config.batch_size * config.updates_per_call + 6 * config.block_env_steps * config.samples_per_insert
+    assert 0 <= ahead - config.min_replay * config.samples_per_insert <= band
+
+
+def test_kill_9_of_the_whole_job_costs_only_what_came_after_the_last_checkpoint(shoal, tmp_path):
+    job = Job(tmp_path, "train", "--name", "r", *flags(LONG))
+    try:
+        job.wait_for_checkpoints("r", 3)
+    finally:
+        job.kill_all()
+    _, run = the_run(tmp_path)
+    assert run.info.status == "RUNNING", "nobody could say that it ended"
+    before, _ = newest_valid(tmp_path / "runs/r/checkpoints")
+    end = before.state["env_steps"] + 8_000
+    done = shoal("resume", "r", "--total-env-steps", str(end))
+    assert done.returncode == 0, done.stderr
+    assert str(before.folder) in done.stdout
+    after, _ = newest_valid(tmp_path / "runs/r/checkpoints")
+    assert end <= after.state["env_steps"] < end + 8_000
+    assert after.state["updates"] > before.state["updates"]
+    assert the_run(tmp_path)[1].info.status == "FINISHED"
+    assert_history_is_the_journal(tmp_path, "r")
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(shoal, tmp_path):
+    job = Job(tmp_path, "train", "--name", "r", *flags(LONG))
+    try:
+        job.wait_for_checkpoints("r", 1)
+        job.process.send_signal(signal.SIGINT)
+        assert job.process.wait(60) == 128 + signal.SIGINT, job.log.read_text()
+    finally:
+        if job.process.poll() is None:
+            job.kill_all()
+    output = job.log.read_text()
+    assert "stopped by SIGINT" in output
+    assert f"shoal resume {tmp_path}/runs/r" in output
+    assert "Traceback" not in output
+    assert the_run(tmp_path)[1].info.status == "KILLED"
+    saved, skipped = newest_valid(tmp_path / "runs/r/checkpoints")
+    assert not skipped
+    said = int(output.split("stopped by SIGINT at ")[1].split()[0].replace(",", ""))
+    assert saved.state["env_steps"] == said, "the checkpoint is of the moment of the stop"
+    done = shoal("resume", "r", "--total-env-steps", str(saved.state["env_steps"] + 4_000))
+    assert done.returncode == 0, done.stderr
+    assert the_run(tmp_path)[1].info.status == "FINISHED"
+    assert_history_is_the_journal(tmp_path, "r")
