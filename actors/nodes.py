@@ -123,7 +123,7 @@ class RolloutNode:
         return reports
 
     def _report(self, block: TransitionBlock, reply: AddReply) -> BlockReport:
-        if reply.weights is not None:
+        if reply.weights is not None and reply.weights_version > self._worker.policy_version:
             self._worker.set_weights(self._calls.get(reply.weights))
         return BlockReport(
             header=block.header,

@@ -127,8 +127,11 @@ class ReplayShard:
           ValueError: the saved rows do not fit this shard.
         """
         rows = load_rows(path, self._rows.dtype)
-        if len(rows) != state["size"] or len(rows) > len(self._rows):
+        if len(rows) != state["size"]:
             raise ValueError(f"{path} holds {len(rows)} transitions, not the {state['size']} of its checkpoint")
+        capacity = len(self._rows)
+        if len(rows) > capacity or (len(rows) < capacity and state["next"] != len(rows)):
+            raise ValueError(f"{path} is the ring of a shard with another capacity than {capacity}")
         self._rows[: len(rows)] = rows
         self._next, self._size = state["next"], state["size"]
         self._inserted, self._dropped = state["inserted"], state["dropped"]

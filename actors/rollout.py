@@ -61,6 +61,11 @@ class RolloutWorker:
         self._observation = reset_seeded(self._env, [int(word) for word in words])
         self._policy: Policy | None = None
 
+    @property
+    def policy_version(self) -> int:
+        """Version of the weights in use; -1 before there are any."""
+        return -1 if self._policy is None else self._policy.weights.version
+
     def set_weights(self, weights: WeightsSnapshot) -> None:
         """Acts with these weights from the next env step on."""
         self._policy = Policy(weights)

@@ -76,11 +76,14 @@ def load_episodes(path: Path) -> tuple[list[Episode], WorldConfig]:
         raise ValueError(f"{path} holds no recorded episodes; name a folder that `shoal watch` wrote") from error
     if root.attrs.get("format") != FORMAT:
         raise ValueError(f"{path} is not in format {FORMAT}; record the episodes again")
-    attributes: Any = root.attrs["config"]
-    ends = _read(root, "meta/episode_ends")
+    try:
+        attributes: Any = root.attrs["config"]
+        ends = _read(root, "meta/episode_ends")
+        columns = {key: _read(root, f"data/{key}") for key in TIME_KEYS}
+        meta = {key: _read(root, f"meta/{key}") for key in ("goal", "learner", "outcome", "seed")}
+    except KeyError as error:
+        raise ValueError(f"{path} is incomplete ({error}); record the episodes again") from error
     starts = np.concatenate([[0], ends[:-1]])
-    columns = {key: _read(root, f"data/{key}") for key in TIME_KEYS}
-    meta = {key: _read(root, f"meta/{key}") for key in ("goal", "learner", "outcome", "seed")}
     episodes = [
         Episode(
             **{key: column[start:end] for key, column in columns.items()},

@@ -11,7 +11,8 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from sim_core import ENV_ID
-from sim_core.config import ConfigError, WorldConfig
+from sim_core.checks import ConfigError
+from sim_core.config import WorldConfig
 
 
 class EnvSpec(NamedTuple):

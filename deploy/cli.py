@@ -16,7 +16,7 @@ import tyro  # noqa: E402
 
 from deploy.options import Command, Evaluate, Resume, Train, Watch  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
-from sim_core.config import ConfigError  # noqa: E402
+from sim_core.checks import ConfigError  # noqa: E402
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -34,10 +34,7 @@ def read_config_file(path: Path) -> RunConfig:
         raise ConfigError(f"--config {path} cannot be read: {error}") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"--config {path} is no valid TOML: {error}") from error
-    try:
-        return from_dict(values)
-    except TypeError as error:
-        raise ConfigError(f"--config {path} holds a value of the wrong type: {error}") from error
+    return from_dict(values)
 
 
 def _config_argument(arguments: Sequence[str]) -> Path | None:

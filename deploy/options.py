@@ -10,7 +10,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from learner.config import RunConfig
-from sim_core.config import require
+from sim_core.checks import require
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from learner.policy_file import read_policy
 from learner.ray_edge import evaluate_in_tasks
 from learner.results import summarise
 from learner.run_folder import RunFolder, find_run
-from sim_core.config import require
+from sim_core.checks import require
 from sim_core.outcomes import OUTCOME_NAMES
 
 

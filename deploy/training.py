@@ -21,7 +21,7 @@ from learner.journal import Row
 from learner.run import RunResult, execute, resume_point
 from learner.run_folder import RunFolder, RunIdentity, find_run
 from learner.tracker import Tracker
-from sim_core.config import ConfigError, require
+from sim_core.checks import ConfigError, require
 
 
 def run_name(config: RunConfig) -> str:

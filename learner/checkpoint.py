@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sim_core.config import ConfigError
+from sim_core.checks import ConfigError
 
 FORMAT = "shoal-checkpoint-1"
 MANIFEST = "manifest.json"

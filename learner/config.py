@@ -11,7 +11,8 @@ from typing import Any, Literal
 from actors.exploration import Exploration
 from actors.vector_env import EnvSpec
 from sim_core import ENV_ID
-from sim_core.config import ConfigError, WorldConfig, require
+from sim_core.checks import ConfigError, check_fields, require
+from sim_core.config import WorldConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,8 +101,8 @@ class RunConfig:
     """Newest checkpoints that are kept."""
 
     def __post_init__(self) -> None:
+        check_fields(self)
         _check_ranges(self)
-        _check_choices(self)
         _check_pairs(self)
 
     @property
@@ -133,22 +134,14 @@ class RunConfig:
 
 
 AT_LEAST_ONE = (
-    "total_env_steps workers envs_per_worker steps_per_block epsilon_decay_env_steps learning_rate_decay_env_steps replay_shards replay_capacity "
-    "min_replay n_step batch_size updates_per_call target_update_interval eval_every_env_steps eval_episodes "
-    "final_eval_episodes log_every_env_steps checkpoint_every_env_steps keep_checkpoints"
+    "total_env_steps workers envs_per_worker steps_per_block epsilon_decay_env_steps "
+    "learning_rate_decay_env_steps replay_shards replay_capacity min_replay n_step batch_size "
+    "updates_per_call target_update_interval eval_every_env_steps eval_episodes final_eval_episodes "
+    "log_every_env_steps checkpoint_every_env_steps keep_checkpoints"
 ).split()
-CHOICES = {
-    "engine": ("ray", "process"),
-    "exploration": ("schedule", "ladder"),
-    "replay_placement": ("learner", "actors"),
-    "algorithm": ("double_dqn", "dqn"),
-}
 
 
 def _check_ranges(config: RunConfig) -> None:
-    for name in [*AT_LEAST_ONE, "seed"]:
-        value = getattr(config, name)
-        require(isinstance(value, int) and not isinstance(value, bool), f"{name} must be a whole number, not {value!r}")
     for name in AT_LEAST_ONE:
         require(getattr(config, name) >= 1, f"{name} must be at least 1, not {getattr(config, name)}")
     require(0 <= config.seed < 2**31, f"seed must be in 0..{2**31 - 1}, not {config.seed}")
@@ -160,15 +153,9 @@ def _check_ranges(config: RunConfig) -> None:
     require(config.ladder_exponent >= 0, f"ladder_exponent must not be negative, not {config.ladder_exponent}")
     sizes = config.hidden_sizes
     require(
-        len(sizes) > 0 and all(isinstance(size, int) and size >= 1 for size in sizes),
-        f"hidden_sizes must be one or more widths of at least 1, not {sizes}",
+        isinstance(sizes, tuple) and len(sizes) > 0 and all(type(size) is int and size >= 1 for size in sizes),
+        f"hidden_sizes must be one or more widths of at least 1, not {sizes!r}",
     )
-
-
-def _check_choices(config: RunConfig) -> None:
-    for name, choices in CHOICES.items():
-        value = getattr(config, name)
-        require(value in choices, f"{name} must be one of {', '.join(choices)}; not {value!r}")
 
 
 def _check_pairs(config: RunConfig) -> None:
@@ -200,6 +187,7 @@ def from_dict(values: dict[str, Any]) -> RunConfig:
       ConfigError: a key is unknown, or a value cannot work.
     """
     world = values.get("world", {})
+    require(isinstance(world, dict), f"world must be a section [world] of settings, not {world!r}")
     for given, known, where in (
         (values, RunConfig.__dataclass_fields__, "config"),
         (world, WorldConfig.__dataclass_fields__, "config section [world]"),
@@ -208,7 +196,7 @@ def from_dict(values: dict[str, Any]) -> RunConfig:
         if unknown:
             raise ConfigError(f"unknown key {unknown[0]!r} in the {where}; `shoal train --help` lists the keys")
     plain = {**values, "world": WorldConfig(**world)}
-    if "hidden_sizes" in plain:
+    if isinstance(plain.get("hidden_sizes"), list):
         plain["hidden_sizes"] = tuple(plain["hidden_sizes"])
     return RunConfig(**plain)
 

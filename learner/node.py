@@ -78,12 +78,10 @@ class LearnerNode:
         if not self._sizes.all():
             self._sizes[:] = self._ask_all("size")
         shares = self._rng.multinomial(count, self._sizes / self._sizes.sum())
-        refs = [
-            self._shard_calls.start(shard, "sample", int(share))
-            for shard, share in zip(self._shards, shares, strict=True)
-        ]
+        asked = np.flatnonzero(shares)  # a shard may still be empty
+        refs = [self._shard_calls.start(self._shards[i], "sample", int(shares[i])) for i in asked]
         replies = [self._shard_calls.get(ref) for ref in refs]
-        self._sizes[:] = [reply.size for reply in replies]
+        self._sizes[asked] = [reply.size for reply in replies]
         return self._rng.permutation(np.concatenate([reply.rows for reply in replies]))
 
     def _ask_all(self, method: str) -> list[Any]:

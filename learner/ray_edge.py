@@ -24,7 +24,7 @@ from actors.vector_env import EnvSpec, env_shape
 from learner.cluster import Cluster, learner_settings, rollout_settings, shard_settings
 from learner.config import RunConfig
 from learner.node import LearnerNode
-from sim_core.config import ConfigError
+from sim_core.checks import ConfigError
 
 PUSHES_IN_FLIGHT = 1
 """Pushes of a worker that may be under way while it collects the next block."""

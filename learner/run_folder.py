@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from learner.config import RunConfig, from_dict, to_dict
-from sim_core.config import ConfigError
+from sim_core.checks import ConfigError
 
 
 class RunIdentity(NamedTuple):

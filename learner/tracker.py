@@ -19,7 +19,7 @@ from actors.network import QNetwork, WeightsSnapshot, load_snapshot
 from actors.vector_env import EnvShape
 from learner.config import RunConfig, config_hash
 from learner.journal import Row
-from sim_core.config import ConfigError
+from sim_core.checks import ConfigError
 
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")

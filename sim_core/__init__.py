@@ -5,7 +5,8 @@ Importing the package registers `shoal/SegregatedSwarm-v0` with Gymnasium.
 
 import gymnasium
 
-from sim_core.config import ConfigError, WorldConfig
+from sim_core.checks import ConfigError
+from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
 
 ENV_ID = "shoal/SegregatedSwarm-v0"

@@ -6,15 +6,11 @@ kernel. Field names carry their unit (`_m`, `_s`, `_m_s`, `_deg`, `_steps`).
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Literal
 
-
-class ConfigError(Exception):
-    """A setting that cannot work; the message says what, where and how to mend it."""
-
+from sim_core.checks import check_fields, require
 
 MAX_HEADINGS = 64
 
@@ -105,7 +101,7 @@ class WorldConfig:
     """`uniform`: robots slow down within this distance of the goal."""
 
     def __post_init__(self) -> None:
-        _check_types(self)
+        check_fields(self)
         _check_counts(self)
         _check_lengths(self)
         _check_start_room(self)
@@ -124,33 +120,6 @@ class WorldConfig:
     def setup(self) -> str:
         """The setup as the dissertation writes it, such as `10r×2g`."""
         return f"{self.robots}r×{self.groups}g"
-
-
-def require(condition: bool, message: str) -> None:
-    """Raises ConfigError with `message` unless `condition` holds."""
-    if not condition:
-        raise ConfigError(message)
-
-
-def _check_types(config: WorldConfig) -> None:
-    defaults = {field.name: field.default for field in dataclasses.fields(config)}
-    for name, default in defaults.items():
-        value = getattr(config, name)
-        if isinstance(default, bool) or isinstance(default, str):
-            require(isinstance(value, type(default)), f"{name} must be a {type(default).__name__}, not {value!r}")
-        elif isinstance(default, int):
-            ok = isinstance(value, int) and not isinstance(value, bool)
-            require(ok, f"{name} must be a whole number, not {value!r}")
-        else:
-            ok = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            require(ok, f"{name} must be a finite number, not {value!r}")
-    require(config.method == "sensor", f"method must be one of: sensor; not {config.method!r}")
-    require(
-        config.flocking in ("published", "uniform"), f"flocking must be published or uniform, not {config.flocking!r}"
-    )
-    require(
-        config.reward_clock in ("step", "horizon"), f"reward_clock must be step or horizon, not {config.reward_clock!r}"
-    )
 
 
 def _check_counts(config: WorldConfig) -> None:
@@ -222,6 +191,11 @@ def _check_start_room(config: WorldConfig) -> None:
         < config.outer_radius_m,
         f"the learning robot could start lost: its next robot, start_spacing_m ({config.start_spacing_m}) away "
         f"and each shifted by start_jitter_m, must be nearer than outer_radius_m (R2 = {config.outer_radius_m})",
+    )
+    require(
+        2 * config.arena_radius_m - start_grid_radius_m(config) > config.outer_radius_m,
+        f"groups would start at their goal: arena_radius_m ({config.arena_radius_m}) must put the start "
+        f"grid farther than outer_radius_m (R2 = {config.outer_radius_m}) from the goal opposite",
     )
     room_m = 2 * config.arena_radius_m * math.sin(math.pi / config.groups) if config.groups > 1 else math.inf
     need_m = 2 * (start_grid_radius_m(config) + config.robot_radius_m)

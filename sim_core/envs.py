@@ -24,7 +24,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from sim_core.config import ConfigError, WorldConfig
+from sim_core.checks import ConfigError
+from sim_core.config import WorldConfig
 from sim_core.methods import make_method
 from sim_core.outcomes import Outcome
 from sim_core.render import draw_world

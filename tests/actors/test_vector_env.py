@@ -6,7 +6,8 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from actors.vector_env import EnvSpec, env_shape, final_observations, make_vector_env, reset_seeded, spaces_of
-from sim_core.config import ConfigError, WorldConfig
+from sim_core.checks import ConfigError
+from sim_core.config import WorldConfig
 from sim_core.envs import SwarmEnv, SwarmVectorEnv
 
 NUM_ENVS = 3

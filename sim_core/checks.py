@@ -1,0 +1,50 @@
+"""Refusing bad settings: the error, and a check of a config's fields against their annotations."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import typing
+from typing import Any, Literal
+
+
+class ConfigError(Exception):
+    """A setting that cannot work; the message says what, where and how to mend it."""
+
+
+def require(condition: bool, message: str) -> None:
+    """Raises ConfigError with `message` unless `condition` holds."""
+    if not condition:
+        raise ConfigError(message)
+
+
+def check_fields(config: Any) -> None:
+    """Checks a config dataclass's bool, int, float, str and Literal fields; others are their owner's to check.
+
+    Raises:
+      ConfigError: a value is not of its field's type, not finite, or none of its choices.
+    """
+    hints = typing.get_type_hints(type(config))
+    for field in dataclasses.fields(config):
+        wanted, value = hints[field.name], getattr(config, field.name)
+        if typing.get_origin(wanted) is Literal:
+            choices = typing.get_args(wanted)
+            known = isinstance(value, str) and value in choices
+            require(known, f"{field.name} must be one of: {', '.join(choices)}; not {value!r}")
+        elif wanted is int:
+            whole = isinstance(value, int) and not isinstance(value, bool)
+            require(whole, f"{field.name} must be a whole number, not {value!r}")
+        elif wanted is float:
+            require(_is_finite_number(value), f"{field.name} must be a finite number, not {value!r}")
+        elif wanted in (bool, str):
+            name = "true or false" if wanted is bool else "a text"
+            require(isinstance(value, wanted), f"{field.name} must be {name}, not {value!r}")
+
+
+def _is_finite_number(value: Any) -> bool:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond float's range
+        return False

@@ -1,0 +1,97 @@
+"""Evaluation: one episode a seed, against one environment stepped in a plain loop."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from actors import evaluator
+from actors.evaluator import evaluate, record_episode, record_frames
+from actors.network import Policy
+from actors.transitions import NO_OUTCOME
+from sim_core.envs import SwarmEnv
+
+SEEDS = [2_000_000_000 + i for i in range(7)]
+
+
+def play(env, policy, seed):
+    """(outcome, length, return) of one greedy episode."""
+    observation, _ = env.reset(seed=seed)
+    length, total, ended = 0, 0.0, False
+    while not ended:
+        observation, reward, terminated, truncated, info = env.step(policy.greedy(observation[None])[0])
+        length, total, ended = length + 1, total + reward, terminated or truncated
+    return info.get("outcome", NO_OUTCOME), length, total
+
+
+@pytest.mark.parametrize("name", ["swarm", "cart_pole"])
+def test_equals_single_episodes(name, request, make_weights):
+    spec = request.getfixturevalue(name)
+    weights = make_weights(spec, seed=3)
+    env = SwarmEnv(**vars(spec.world)) if spec.is_swarm else gym.make(spec.env_id)
+    expected = [play(env, Policy(weights), seed) for seed in SEEDS]
+    stats = evaluate(spec, weights, SEEDS)
+    assert list(zip(stats.outcome, stats.length_steps, strict=True)) == [row[:2] for row in expected]
+    np.testing.assert_allclose(stats.episode_return, [row[2] for row in expected], rtol=1e-9)
+    assert len(set(stats.length_steps)) > 1  # or short episodes could not be over-counted
+    env.close()
+
+
+@pytest.mark.parametrize("chunk", [1, 2, 3, 7])
+def test_does_not_depend_on_how_many_play_at_once(monkeypatch, swarm, make_weights, chunk):
+    weights = make_weights(swarm)
+    expected = evaluate(swarm, weights, SEEDS)
+    monkeypatch.setattr(evaluator, "MAX_ENVS", chunk)
+    for first, second in zip(evaluate(swarm, weights, SEEDS), expected, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+def test_entries_are_in_the_order_of_the_seeds(swarm, make_weights):
+    weights = make_weights(swarm)
+    backwards = evaluate(swarm, weights, SEEDS[::-1])
+    for first, second in zip(evaluate(swarm, weights, SEEDS), backwards, strict=True):
+        np.testing.assert_array_equal(first, second[::-1])
+    assert [len(column) for column in evaluate(swarm, weights, [])] == [0, 0, 0]
+
+
+def test_a_recorded_episode_is_the_evaluated_one(swarm, make_weights):
+    weights = make_weights(swarm, seed=5)
+    stats = evaluate(swarm, weights, SEEDS)
+    for i, seed in enumerate(SEEDS):
+        episode = record_episode(swarm, weights, seed)
+        assert (episode.outcome, episode.seed) == (stats.outcome[i], seed)
+        assert len(episode.action) == stats.length_steps[i] + 1
+        assert episode.reward.sum(dtype=np.float64) == pytest.approx(stats.episode_return[i], rel=1e-6)
+        assert episode.action[-1] == -1 and episode.reward[-1] == 0 and (episode.action[:-1] >= 0).all()
+
+
+def test_a_recorded_episode_holds_what_happened(swarm, make_weights):
+    episode = record_episode(swarm, make_weights(swarm), SEEDS[0])
+    worlds = SwarmEnv(**vars(swarm.world))
+    worlds.reset(seed=SEEDS[0])
+    for t, action in enumerate(episode.action):
+        np.testing.assert_array_equal(episode.position[t], worlds.worlds.positions()[0])
+        np.testing.assert_array_equal(episode.machine[t], worlds.worlds.state.machine[0])
+        np.testing.assert_array_equal(episode.velocity[t, :, 0], worlds.worlds.state.vel_x[0])
+        np.testing.assert_array_equal(episode.velocity[t, :, 1], worlds.worlds.state.vel_y[0])
+        if action >= 0:
+            assert worlds.step(action)[1] == episode.reward[t]
+    moved = np.diff(episode.position, axis=0)
+    step_s = swarm.world.time_step_s
+    np.testing.assert_allclose(moved, episode.velocity[1:] * step_s, atol=1e-5)
+    np.testing.assert_array_equal(episode.goal, worlds.worlds.goals()[0])
+    assert 0 <= episode.learner < swarm.world.num_robots
+
+
+def test_frames_of_an_environment_without_images(monkeypatch, cart_pole, make_weights):
+    def no_images(env_id, render_mode):
+        raise gym.error.UnsupportedMode(render_mode)
+
+    monkeypatch.setattr(gym, "make", no_images)
+    assert record_frames(cart_pole, make_weights(cart_pole), 1) == ([], 0.0)
+
+
+def test_frames_of_our_environment_have_one_image_a_step(cart_pole, swarm, make_weights):
+    spec, weights = swarm._replace(env_id="CartPole-v1"), make_weights(cart_pole)
+    frames, frames_per_s = record_frames(spec, weights, 4)
+    assert frames_per_s == 50 and len(frames) == evaluate(spec, weights, [4]).length_steps[0]
+    assert frames[0].dtype == np.uint8 and frames[0].ndim == 3
