@@ -102,12 +102,12 @@ class Evaluate:
 
 @dataclass(frozen=True, kw_only=True)
 class Watch:
-    """Render one greedy episode of a run, as a web page with a player or as a video."""
+    """Render one greedy episode of a run: a web page with a player, a video, or a strip of frames."""
 
     run: Positional[str]
     """Name of the run, or its folder."""
-    format: Literal["html", "mp4"] = "html"
-    """Page with a player (our own environment only) or video."""
+    format: Literal["html", "mp4", "png"] = "html"
+    """Page with a player, video, or strip of frames (other environments than ours: video only)."""
     seed: int = 2_000_000_000
     """Seed of the episode."""
     out: Path | None = None

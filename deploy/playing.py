@@ -11,6 +11,7 @@ from actors.evaluator import record_episode
 from actors.network import WeightsSnapshot
 from actors.trajectory import save_episodes
 from actors.vector_env import env_shape
+from dashboards.strip import episode_strip_png
 from deploy.artifacts import foreign_animation, write_player, write_video
 from deploy.options import Evaluate, Watch, ray_address
 from deploy.tables import evaluation_table
@@ -65,7 +66,7 @@ def watch(command: Watch) -> int:
     if config.env.is_swarm:
         _watch_swarm(config, weights, command, folder.artifacts, path)
     else:
-        require(command.format == "mp4", f"{config.env_id} has no player page; use --format mp4")
+        require(command.format == "mp4", f"{config.env_id} can only be watched as a video; use --format mp4")
         made = foreign_animation(config, weights, command.seed, path)
         require(bool(made), f"{config.env_id} cannot be rendered to images (no rgb_array mode)")
     Console().print(str(path), highlight=False, soft_wrap=True)
@@ -77,8 +78,10 @@ def _watch_swarm(config: RunConfig, weights: WeightsSnapshot, command: Watch, ar
     store.parent.mkdir(parents=True, exist_ok=True)
     episode = record_episode(config.env, weights, command.seed)
     save_episodes(store, [episode], config.world)
-    if command.format == "mp4":
+    if command.format == "html":
+        write_player(store, path, f"{config.world.method} {config.world.setup}")
+    elif command.format == "mp4":
         write_video(store, path)
     else:
-        write_player(store, path, f"{config.world.method} {config.world.setup}")
+        episode_strip_png(episode, config.world, path)
     Console().print(f"{len(episode.action) - 1} env steps, outcome {OUTCOME_NAMES[episode.outcome]}", highlight=False)

@@ -88,6 +88,8 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         ) from error
     if found != FORMAT:
         raise CheckpointError(f"checkpoint {folder} is in format {found!r}, this version reads {FORMAT}")
+    if not isinstance(sums, dict) or STATE not in sums:
+        raise CheckpointError(f"checkpoint {folder} is damaged ({MANIFEST}); use an older one or train anew")
     for name, expected in sums.items():
         path = folder / name
         if not path.is_file() or _sha256(path) != expected:

@@ -87,7 +87,7 @@ class RunConfig:
     max_gradient_norm: float = 10.0
     """Gradients are scaled down to this norm."""
 
-    eval_every_env_steps: int = 500_000
+    eval_every_env_steps: int = 250_000
     """Env steps between two evaluations during training."""
     eval_episodes: int = 100
     """Greedy episodes of an evaluation during training."""

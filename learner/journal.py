@@ -37,6 +37,7 @@ class Journal:
         self._file = path.open("ab")
         length = self._file.seek(0, os.SEEK_END)
         if length < offset:
+            self._file.close()
             raise ValueError(f"{path} has {length} bytes, its checkpoint knows {offset}")
         self._file.truncate(offset)
         self._file.seek(offset)

@@ -78,7 +78,7 @@ class Meters:
 
     def get_state(self) -> dict[str, Any]:
         """The sums, for JSON; clocks start anew on resume."""
-        return {"sums": self._sums, "epsilon": self._epsilon}
+        return {"sums": dict(self._sums), "epsilon": self._epsilon}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Takes up what `get_state` gave."""

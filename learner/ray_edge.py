@@ -127,14 +127,11 @@ def evaluate_in_tasks(spec: EnvSpec, weights: WeightsSnapshot, seeds: list[int],
       One entry a seed; their order is not that of the seeds.
     """
     connect(1, address)
-    try:
-        calls = RayCalls()
-        tasks = max(1, int(ray.cluster_resources().get("CPU", 1)))
-        shared = calls.put(weights)
-        refs = [calls.run(evaluate, spec, shared, seeds[i::tasks]) for i in range(min(tasks, len(seeds)))]
-        return join_stats([calls.get(ref) for ref in refs])
-    finally:
-        ray.shutdown()
+    calls = RayCalls()
+    tasks = max(1, int(ray.cluster_resources().get("CPU", 1)))
+    shared = calls.put(weights)
+    refs = [calls.run(evaluate, spec, shared, seeds[i::tasks]) for i in range(min(tasks, len(seeds)))]
+    return join_stats([calls.get(ref) for ref in refs])
 
 
 def ray_cluster(config: RunConfig, incarnation: int, address: str | None) -> Cluster:

@@ -13,7 +13,7 @@ from learner.config import RunConfig, config_hash
 from learner.journal import Journal, PushedMark, Row
 from learner.loop import TrainingLoop
 from learner.ray_edge import ray_cluster
-from learner.results import Evaluation, as_metrics
+from learner.results import Evaluation, final_metrics
 from learner.run_folder import RunFolder
 from learner.stopping import stop_on_signals
 from learner.tracker import Tracker
@@ -125,12 +125,10 @@ def execute(
     status = "FAILED"
     try:
         cluster = open_cluster(config, state["incarnation"] + 1, address)
-        try:
-            result = _train(folder, config, tracker, display, checkpoint, journal, cluster)
-        finally:
-            cluster.close()
+        result = _train(folder, config, tracker, display, checkpoint, journal, cluster)
+        cluster.close()  # after an error Ray closes at exit: references that the traceback holds outlive no earlier end
         if result.evaluation is not None:
-            tracker.final(as_metrics(result.evaluation), journal.rows()[-1].time_ms)
+            tracker.final(final_metrics(result.evaluation), journal.rows()[-1].time_ms)
             finish(result, journal.rows())
         status = "FINISHED" if result.stopped_by is None else "KILLED"
         return result

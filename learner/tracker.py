@@ -29,6 +29,7 @@ import mlflow.pytorch  # noqa: E402
 from mlflow.entities import Metric, Param, RunTag  # noqa: E402
 from mlflow.exceptions import MlflowException  # noqa: E402
 from mlflow.models import infer_signature  # noqa: E402
+from sqlalchemy.exc import SQLAlchemyError  # noqa: E402
 
 MAX_BATCH = 900
 """Metrics of one request; MLflow takes at most 1,000."""
@@ -81,7 +82,7 @@ class Tracker:
             self._experiment_id = (
                 found.experiment_id if found else self._client.create_experiment(experiment, artifact_root)
             )
-        except (MlflowException, OSError) as error:
+        except (MlflowException, SQLAlchemyError, OSError) as error:
             first_line = str(error).splitlines()[0]
             raise ConfigError(
                 f"the MLflow store {uri} cannot be opened ({first_line}); name another --tracking-uri"

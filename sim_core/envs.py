@@ -78,6 +78,8 @@ class SwarmEnv(gym.Env[NDArray[Any], np.int64]):
       ConfigError: a setting is unknown or cannot work.
     """
 
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # gym.make asks the class
+
     def __init__(self, render_mode: str | None = None, **settings: Any) -> None:
         _check_render_mode(render_mode)
         self.config = make_config(settings)
@@ -106,7 +108,7 @@ class SwarmEnv(gym.Env[NDArray[Any], np.int64]):
         Raises:
           ValueError: the action is none of the action space.
         """
-        if not self.action_space.contains(np.int64(action)):
+        if not self.action_space.contains(action):
             raise ValueError(f"action must be in 0..{self.config.num_actions - 1}, not {action!r}")
         result = self.worlds.step(np.array([action], np.int64))
         outcome = int(result.outcome[0])
@@ -134,6 +136,8 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
     Raises:
       ConfigError: a setting is unknown or cannot work.
     """
+
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(self, num_envs: int = 1, render_mode: str | None = None, **settings: Any) -> None:
         _check_render_mode(render_mode)
@@ -176,10 +180,11 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
         Raises:
           ValueError: an action is none of the action space.
         """
-        actions = np.asarray(actions, np.int64)
-        if actions.shape != (self.num_envs,) or actions.min() < 0 or actions.max() >= self.config.num_actions:
+        actions = np.asarray(actions)
+        whole = actions.shape == (self.num_envs,) and np.issubdtype(actions.dtype, np.integer)
+        if not whole or actions.min() < 0 or actions.max() >= self.config.num_actions:
             raise ValueError(f"actions must be {self.num_envs} whole numbers in 0..{self.config.num_actions - 1}")
-        result = self.worlds.step(actions)
+        result = self.worlds.step(actions.astype(np.int64, copy=False))
         done, terminated = is_done(result.outcome), is_terminated(result.outcome)
         observation, infos = result.observation, dict[str, Any]()
         if done.any():

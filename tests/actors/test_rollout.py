@@ -43,7 +43,7 @@ def by_hand(spec, worlds, rows):
     for step in rows.reshape(-1, NUM_ENVS):
         after, reward, terminated, truncated, infos = env.step(step["action"])
         done = terminated | truncated
-        reached = np.where(done[:, None, None], infos["final_obs"], after) if done.any() else after
+        reached = np.where(done[:, None], infos["final_obs"], after) if done.any() else after
         columns.append((observation, reward, np.where(terminated, 0.0, 0.9), reached))
         if done.any():
             info = infos["final_info"]
@@ -124,7 +124,9 @@ def test_an_environment_without_outcomes(cart_pole, make_worker):
     np.testing.assert_array_equal(stats.episode_return, stats.length_steps)  # one reward a step
     fallen = rows["discount"] == 0
     assert fallen.sum() == len(stats.outcome)
-    beyond = (np.abs(rows["next_observation"][:, 0]) > 2.4) | (np.abs(rows["next_observation"][:, 2]) > 12 * np.pi / 180)
+    beyond = (np.abs(rows["next_observation"][:, 0]) > 2.4) | (
+        np.abs(rows["next_observation"][:, 2]) > 12 * np.pi / 180
+    )
     np.testing.assert_array_equal(fallen, beyond)  # final states, not the first ones of the next episodes
 
 

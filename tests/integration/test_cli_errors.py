@@ -178,3 +178,6 @@ class TestWithARun:
         assert "<canvas" in page.read_text()
         assert main(["watch", "r", "--runs-dir", str(runs), "--format", "mp4", "--out", str(video)]) == 0
         assert video.read_bytes()[4:8] == b"ftyp"
+        strip = tmp_path / "e.png"
+        assert main(["watch", "r", "--runs-dir", str(runs), "--format", "png", "--out", str(strip)]) == 0
+        assert strip.read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,177 @@
+"""Rollout nodes and shard nodes: pushes, replies, reports and state."""
+
+import numpy as np
+import pytest
+
+from actors.calls import Done, LocalCalls
+from actors.nodes import RolloutNode, ShardNode, ShardSettings
+from actors.rollout import RolloutSettings, RolloutWorker
+from actors.transitions import transition_dtype
+from actors.vector_env import env_shape
+
+NUM_ENVS, STEPS = 2, 8
+BLOCK = NUM_ENVS * STEPS
+
+
+class Later:
+    """A result that is there once it has been asked for."""
+
+    def __init__(self, node, method, args):
+        self.call, self.value, self.done = (node, method, args), None, False
+
+
+class DeferredCalls(LocalCalls):
+    """Calls that run when somebody asks for them, as if in another, busy process."""
+
+    def start(self, node, method, *args):
+        return Later(node, method, args)
+
+    def get(self, ref):
+        if isinstance(ref, Done):
+            return ref.value
+        if not ref.done:
+            node, method, args = ref.call
+            ref.value, ref.done = getattr(node, method)(*args), True
+        return ref.value
+
+
+@pytest.fixture
+def make_shard(swarm):
+    return lambda: ShardNode(ShardSettings(transition_dtype(env_shape(swarm).observation_space), 1000, 0))
+
+
+@pytest.fixture
+def settings(swarm):
+    return RolloutSettings(swarm, NUM_ENVS, STEPS, 1, 0.9, 7)
+
+
+@pytest.fixture
+def make_node(swarm, settings, make_weights):
+    """Function: a rollout node with weights of version 10."""
+
+    def make(shards, calls=None, pushes_in_flight=0, worker_id=0):
+        node = RolloutNode(settings, worker_id, 0, calls or LocalCalls(), shards, pushes_in_flight)
+        node.set_weights(make_weights(swarm, version=10, time_s=100.0))
+        return node
+
+    return make
+
+
+def test_blocks_go_to_the_shards_in_turn(make_node, make_shard):
+    shards = [make_shard() for _ in range(3)]
+    node = make_node(shards, worker_id=4)
+    sizes = []
+    for _ in range(4):
+        assert [report.stored for report in node.collect(0.5)] == [BLOCK]
+        sizes.append([shard.size() // BLOCK for shard in shards])
+    assert sizes == [[0, 1, 0], [0, 1, 1], [1, 1, 1], [1, 2, 1]]
+
+
+def test_what_is_stored_is_what_the_worker_collected(make_node, make_shard, settings, swarm, make_weights):
+    shard, twin = make_shard(), RolloutWorker(settings, 0, 0)
+    twin.set_weights(make_weights(swarm, version=10, time_s=100.0))
+    report = make_node([shard]).collect(0.5)[0]
+    block = twin.collect(0.5)
+    assert report.header == block.header
+    rewards = {row.tobytes() for row in block.rows}
+    assert {row.tobytes() for row in shard.sample(500).rows} == rewards
+
+
+def test_newer_weights_come_with_the_reply(make_node, make_shard, swarm, make_weights):
+    shard = make_shard()
+    node = make_node([shard])
+    shard.publish(13, [Done(make_weights(swarm, seed=1, version=13, time_s=200.0))])
+    first, second = node.collect(0.0)[0], node.collect(0.0)[0]
+    assert (first.header.policy_version, first.staleness_updates) == (10, 3)
+    assert (second.header.policy_version, second.header.policy_time_s, second.staleness_updates) == (13, 200.0, 0)
+
+
+@pytest.mark.parametrize("version", [-1, 9, 10])
+def test_weights_that_are_not_newer_do_not_travel(make_node, make_shard, swarm, make_weights, version):
+    shard = make_shard()
+    node = make_node([shard])
+    if version >= 0:
+        shard.publish(version, ["no reference: must not be looked up"])
+    reports = [node.collect(0.0)[0] for _ in range(2)]
+    assert [report.header.policy_version for report in reports] == [10, 10]
+    assert [report.staleness_updates for report in reports] == [0, 0]
+
+
+def test_a_late_reply_does_not_bring_older_weights_back(make_node, make_shard, swarm, make_weights):
+    shards, calls = [make_shard(), make_shard()], DeferredCalls()
+    node = make_node(shards, calls, pushes_in_flight=2)
+    for shard, version in zip(shards, (15, 12), strict=True):
+        shard.publish(version, [Done(make_weights(swarm, version=version))])
+    assert node.collect(0.0) == node.collect(0.0) == []
+    assert [report.staleness_updates for report in node.settle()] == [5, 2]
+    node.collect(0.0)
+    assert node.settle()[0].header.policy_version == 15
+
+
+def test_staleness_in_seconds_counts_from_publication(monkeypatch, make_node, make_shard):
+    monkeypatch.setattr("actors.nodes.time.time", lambda: 142.5)
+    assert make_node([make_shard()]).collect(0.0)[0].staleness_s == pytest.approx(42.5)
+
+
+@pytest.mark.parametrize("limit", [0, 1, 3])
+def test_a_block_is_reported_once_it_is_stored(make_node, make_shard, limit):
+    shard = make_shard()
+    node = make_node([shard], DeferredCalls(), pushes_in_flight=limit)
+    reported = []
+    for i in range(6):
+        reports = node.collect(0.5)
+        assert len(reports) == (1 if i >= limit else 0)
+        reported += reports
+        assert shard.size() == BLOCK * len(reported)
+    settled = node.settle()
+    assert len(settled) == limit and node.settle() == []
+    assert [report.header.sequence for report in reported + settled] == list(range(6))
+    assert shard.size() == 6 * BLOCK
+
+
+def test_a_duplicate_is_reported_as_nothing_stored(make_node, make_shard):
+    shard = make_shard()
+    assert make_node([shard]).collect(0.5)[0].stored == BLOCK
+    assert make_node([shard]).collect(0.5)[0].stored == 0
+    assert shard.size() == BLOCK
+
+
+def test_a_failed_push_comes_out(make_node, make_shard, cart_pole):
+    other = ShardNode(ShardSettings(transition_dtype(env_shape(cart_pole).observation_space), 1000, 0))
+    with pytest.raises(ValueError, match="schema"):
+        make_node([other]).collect(0.5)
+
+
+def test_a_saved_node_goes_on_where_it_was(tmp_path, make_node, make_shard):
+    shards = [make_shard(), make_shard()]
+    node = make_node(shards)
+    node.collect(0.5)
+    state = node.save(tmp_path / "worker.safetensors")
+    expected = [node.collect(0.5)[0] for _ in range(2)]
+    again = [make_shard(), make_shard()]
+    resumed = make_node(again)
+    resumed.load(tmp_path / "worker.safetensors", state)
+    for report in expected:
+        other = resumed.collect(0.5)[0]
+        assert other.header == report.header
+        for first, second in zip(other.episodes, report.episodes, strict=True):
+            np.testing.assert_array_equal(first, second)
+    assert [shard.size() // BLOCK for shard in again] == [1, 1]
+
+
+def test_nothing_is_saved_while_pushes_are_under_way(tmp_path, make_node, make_shard):
+    node = make_node([make_shard()], DeferredCalls(), pushes_in_flight=1)
+    node.collect(0.5)
+    with pytest.raises(RuntimeError, match="settle"):
+        node.save(tmp_path / "worker.safetensors")
+    node.settle()
+    node.save(tmp_path / "worker.safetensors")
+
+
+def test_damaged_files_are_refused(tmp_path, make_node, make_shard):
+    node, path = make_node([make_shard()]), tmp_path / "worker.safetensors"
+    state = node.save(path)
+    path.write_bytes(path.read_bytes()[:-9])
+    for damaged in (path, tmp_path / "missing.safetensors"):
+        with pytest.raises(ValueError, match="cannot be read"):
+            node.load(damaged, state)

@@ -1,0 +1,42 @@
+"""The parts of a run take their settings from its config."""
+
+import dataclasses
+
+import pytest
+
+from actors.vector_env import env_shape
+from learner.cluster import learner_settings, process_cluster, rollout_settings, shard_settings
+
+
+def test_settings_are_those_of_the_config(small_run):
+    shape = env_shape(small_run.env)
+    learner = learner_settings(small_run, shape)
+    assert (learner.observation_size, learner.num_actions, learner.hidden_sizes) == (8, 4, (8,))
+    assert learner.double and not learner_settings(dataclasses.replace(small_run, algorithm="dqn"), shape).double
+    for settings in (learner, rollout_settings(small_run)):
+        for name in {"batch_size", "target_update_interval", "steps_per_block", "n_step", "discount", "seed"}:
+            assert getattr(settings, name, None) in (None, getattr(small_run, name)), name
+    assert rollout_settings(small_run).num_envs == 4
+
+
+def test_shards_share_the_capacity_and_draw_from_their_own_streams(small_run):
+    config = dataclasses.replace(small_run, replay_shards=3)
+    settings = shard_settings(config, env_shape(config.env))
+    assert [shard.capacity for shard in settings] == [333, 333, 333]
+    assert len({shard.seed for shard in settings}) == 3
+
+
+@pytest.mark.parametrize("placement", ["learner", "actors"])
+def test_workers_push_to_the_shards_of_either_placement(small_run, placement):
+    config = dataclasses.replace(small_run, replay_placement=placement, replay_shards=2, workers=2)
+    cluster = process_cluster(config, 5)
+    weights = cluster.calls.get(cluster.learner.weights()[0])
+    for worker in cluster.workers:
+        worker.set_weights(weights)
+    reports = [worker.collect(0.5)[0] for worker in cluster.workers for _ in range(2)]
+    assert [report.header.worker_id for report in reports] == [0, 0, 1, 1]
+    assert {report.header.incarnation for report in reports} == {5}
+    stored = sum(report.stored for report in reports)
+    rows = cluster.learner.update(2, 1e-3)
+    assert 0 < stored <= 4 * config.block_env_steps and rows.version == 2
+    cluster.close()

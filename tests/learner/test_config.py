@@ -1,0 +1,136 @@
+"""The run's settings: what is refused, and what tells two configs apart."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+
+from learner.config import AT_LEAST_ONE, RunConfig, config_hash, from_dict, to_dict
+from sim_core.checks import ConfigError
+from sim_core.config import WorldConfig
+
+
+def test_the_defaults_work_and_are_frozen():
+    config = RunConfig()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        config.seed = 1
+    assert config.env.is_swarm and config.block_env_steps == config.envs_per_worker * config.steps_per_block
+
+
+@pytest.mark.parametrize("name", AT_LEAST_ONE)
+@pytest.mark.parametrize("value", [0, -1, 1.5, 2.0, "3", None, True, math.nan])
+def test_counts_must_be_whole_and_positive(name, value):
+    with pytest.raises(ConfigError, match=name):
+        RunConfig(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("seed", [-1, 2**31, 0.5, True]),
+        ("epsilon_start", [-0.1, 1.1, math.nan, "1"]),
+        ("epsilon_end", [-0.1, 1.1, math.inf]),
+        ("ladder_base", [-0.1, 1.1, None]),
+        ("ladder_exponent", [-1, math.nan, math.inf]),
+        ("discount", [0, -0.5, 1.01, math.nan, True]),
+        ("samples_per_insert", [0, -1, math.nan, math.inf, "4"]),
+        ("learning_rate", [0, -1, math.nan, math.inf]),
+        ("learning_rate_end", [0, -1, math.nan, math.inf]),
+        ("max_gradient_norm", [0, -1, math.nan]),
+        ("hidden_sizes", [(), (0,), (8, -1), (8, 1.5), (True,), 8, "88", None, [8]]),
+        ("engine", ["Ray", "", None, ["ray"]]),
+        ("exploration", ["greedy", 1]),
+        ("replay_placement", ["shard", {}]),
+        ("algorithm", ["ddqn", None]),
+        ("env_id", [None, 3]),
+    ],
+)
+def test_values_out_of_range_are_refused(name, values):
+    for value in values:
+        with pytest.raises(ConfigError, match=name):
+            RunConfig(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"replay_capacity": 2047, "min_replay": 100}, "replay_capacity.*2048 transitions in each of 1"),
+        ({"replay_capacity": 8191, "min_replay": 100, "replay_shards": 4}, "in each of 4"),
+        ({"replay_capacity": 20_000, "min_replay": 20_001}, "min_replay.*must not exceed"),
+        ({"total_env_steps": 20_000, "min_replay": 20_000}, "nothing is learned"),
+    ],
+)
+def test_values_that_contradict_each_other_are_refused(settings, words):
+    with pytest.raises(ConfigError, match=words):
+        RunConfig(**settings)
+
+
+def test_the_last_values_that_work():
+    RunConfig(replay_capacity=8192, min_replay=8192, replay_shards=4, total_env_steps=8193)
+    RunConfig(seed=2**31 - 1, discount=1.0, epsilon_start=0.0, epsilon_end=1, ladder_base=1, ladder_exponent=0)
+
+
+def test_the_learning_rate_falls_linearly_and_stays():
+    config = RunConfig(learning_rate=1e-3, learning_rate_end=2e-4, learning_rate_decay_env_steps=1000)
+    rates = [config.learning_rate_at(env_steps) for env_steps in (0, 250, 1000, 10**9)]
+    assert rates == pytest.approx([1e-3, 8e-4, 2e-4, 2e-4])
+
+
+def test_round_trip_through_json(small_run):
+    for config in (RunConfig(), small_run):
+        assert from_dict(json.loads(json.dumps(to_dict(config)))) == config
+
+
+def test_missing_keys_take_the_defaults():
+    assert from_dict({}) == RunConfig()
+    config = from_dict({"workers": 3, "hidden_sizes": [7], "world": {"robots": 5}})
+    assert config == RunConfig(workers=3, hidden_sizes=(7,), world=WorldConfig(robots=5))
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"worker": 3}, "unknown key 'worker' in the config"),
+        ({"robots": 3}, "unknown key 'robots' in the config"),
+        ({"world": {"robot": 3}}, r"unknown key 'robot' in the config section \[world\]"),
+        ({"world": {"workers": 3}}, r"unknown key 'workers' in the config section \[world\]"),
+        ({"world": 3}, r"section \[world\]"),
+        ({"world": {"robots": 1}}, "robots must be at least 2"),
+        ({"hidden_sizes": 5}, "hidden_sizes"),
+        ({"workers": "three"}, "workers"),
+    ],
+)
+def test_bad_dicts_are_refused(values, words):
+    with pytest.raises(ConfigError, match=words):
+        from_dict(values)
+
+
+def changed(config, name):
+    """`config` with another value of one field that can work."""
+    value = getattr(config, name)
+    others = {
+        "engine": "ray" if value == "process" else "process",
+        "exploration": "ladder",
+        "replay_placement": "actors" if value == "learner" else "learner",
+        "algorithm": "dqn",
+        "env_id": "CartPole-v1",
+        "world": dataclasses.replace(config.world, reward_scale=2.0),
+        "hidden_sizes": (*config.hidden_sizes, 4),
+    }
+    if name not in others:
+        others[name] = value + 1 if isinstance(value, int) else value / 2
+    return dataclasses.replace(config, **{name: others[name]})
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(RunConfig)])
+def test_the_hash_tells_configs_apart_but_for_where_and_how_long(small_run, name):
+    other = changed(small_run, name)
+    assert other != small_run
+    same = config_hash(other) == config_hash(small_run)
+    assert same == (name in ("total_env_steps", "engine"))
+
+
+def test_the_hash_is_stable(small_run):
+    assert config_hash(small_run) == config_hash(from_dict(to_dict(small_run)))
+    assert len(config_hash(small_run)) == 12 and int(config_hash(small_run), 16) >= 0

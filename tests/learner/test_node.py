@@ -1,0 +1,200 @@
+"""The learner's node: sampling over shards, publication, state; and one contract for both placements of a shard."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from actors.calls import Done, LocalCalls
+from actors.network import WeightsSnapshot
+from actors.nodes import ShardNode, ShardSettings
+from actors.rollout import join_stats
+from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock
+from learner.node import LearnerNode
+
+RATE = 1e-3
+
+
+def make_block(rows, sequence=0, worker_id=0, incarnation=0, version=0, schema=SCHEMA_VERSION):
+    header = BlockHeader(schema, worker_id, incarnation, sequence, version, 0.0, 0.0, len(rows))
+    return TransitionBlock(header, rows, join_stats([]))
+
+
+@pytest.fixture
+def make_learner(learner_settings, make_rows):
+    """Function: a learner with embedded shards; also gives the shards."""
+
+    def make(num_shards=1, capacity=50, **other):
+        shards = [ShardNode(ShardSettings(make_rows(0).dtype, capacity, seed)) for seed in range(num_shards)]
+        return LearnerNode(learner_settings._replace(**other), shards, LocalCalls(), LocalCalls()), shards
+
+    return make
+
+
+class ShardContract:
+    """What a rollout node may expect of whatever it pushes to."""
+
+    @pytest.fixture
+    def target(self, make_learner):
+        """(node with `add`, its only shard, function that publishes a version)."""
+        raise NotImplementedError
+
+    def test_stores_a_block(self, target, make_rows):
+        node, shard, _ = target
+        reply = node.add(make_block(make_rows(30)))
+        assert (reply.stored, reply.duplicate, shard.size()) == (30, False, 30)
+
+    def test_stores_a_block_once(self, target, make_rows):
+        node, shard, _ = target
+        node.add(make_block(make_rows(30), sequence=3, incarnation=1))
+        for sequence, incarnation in ((3, 1), (2, 1), (9, 0)):
+            reply = node.add(make_block(make_rows(30), sequence, incarnation=incarnation))
+            assert (reply.stored, reply.duplicate, shard.size()) == (0, True, 30)
+
+    def test_holds_no_more_than_its_capacity(self, target, make_rows):
+        node, shard, _ = target
+        for sequence in range(3):
+            assert node.add(make_block(make_rows(30, seed=sequence), sequence)).stored == 30
+        assert shard.size() == 50
+        newest = np.concatenate([make_rows(30, seed=sequence) for sequence in range(3)])[-50:]
+        assert {row.tobytes() for row in shard.sample(2000).rows} == {row.tobytes() for row in newest}
+
+    def test_refuses_another_schema(self, target, make_rows):
+        node, shard, _ = target
+        with pytest.raises(ValueError, match="schema"):
+            node.add(make_block(make_rows(3), schema=SCHEMA_VERSION + 1))
+        assert shard.size() == 0
+
+    def test_the_reply_carries_newer_weights_only(self, target, make_rows):
+        node, _, publish = target
+        publish()
+        publish()
+        replies = [node.add(make_block(make_rows(3), version, version=version)) for version in range(4)]
+        assert [reply.weights_version for reply in replies] == [2] * 4
+        assert [reply.weights is None for reply in replies] == [False, False, True, True]
+        weights = LocalCalls().get(replies[0].weights)
+        assert isinstance(weights, WeightsSnapshot) and weights.version == 2
+
+
+class TestShardInANodeOfItsOwn(ShardContract):
+    @pytest.fixture
+    def target(self, make_rows):
+        node, versions = ShardNode(ShardSettings(make_rows(0).dtype, 50, 0)), iter((1, 2))
+
+        def publish():
+            version = next(versions)
+            node.publish(version, [Done(WeightsSnapshot(version, 0.0, ()))])
+
+        return node, node, publish
+
+
+class TestShardEmbeddedInTheLearner(ShardContract):
+    @pytest.fixture
+    def target(self, make_learner, make_rows):
+        learner, (shard,) = make_learner()
+
+        def publish():
+            learner._learner.update(make_rows(16), RATE)
+            learner.publish()
+
+        return learner, shard, publish
+
+
+def test_embedded_shards_take_blocks_in_turn(make_learner, make_rows):
+    learner, shards = make_learner(3)
+    for sequence in range(5):
+        learner.add(make_block(make_rows(4), sequence))
+    assert [shard.size() for shard in shards] == [8, 8, 4]
+
+
+def test_an_update_learns_publishes_and_reports(make_learner, make_rows):
+    learner, (shard,) = make_learner()
+    learner.add(make_block(make_rows(40)))
+    before = learner.weights()[0].value
+    report = learner.update(3, RATE)
+    after = report.weights[0].value
+    assert (before.version, report.version, after.version) == (0, 3, 3)
+    assert after.time_s >= before.time_s and learner.weights() == report.weights
+    assert any(not np.array_equal(a, b) for a, b in zip(before.arrays, after.arrays, strict=True))
+    assert shard.add(make_block(make_rows(1), 1)).weights is report.weights[0]
+
+
+@pytest.mark.parametrize("sizes", [(50, 50), (40, 10), (10, 30, 20)])
+def test_rows_of_all_shards_are_drawn_equally_often(make_learner, make_rows, sizes):
+    learner, shards = make_learner(len(sizes))
+    for number, (shard, size) in enumerate(zip(shards, sizes, strict=True)):
+        rows = make_rows(size)
+        rows["action"] = 1000 * number + np.arange(size)
+        shard.add(make_block(rows))
+    drawn = np.concatenate([learner._sample(900)["action"] for _ in range(20)])
+    counts = [np.bincount(drawn[drawn // 1000 == i] % 1000, minlength=size) for i, size in enumerate(sizes)]
+    assert stats.chisquare(np.concatenate(counts)).pvalue > 1e-4
+
+
+def test_every_minibatch_mixes_the_shards(make_learner, make_rows):
+    learner, shards = make_learner(2)
+    for number, shard in enumerate(shards):
+        rows = make_rows(50)
+        rows["action"] = number
+        shard.add(make_block(rows))
+    means = learner._sample(64 * 16)["action"].reshape(64, 16).mean(axis=1)
+    assert 0.1 < means.min() and means.max() < 0.9
+
+
+def test_an_empty_shard_is_no_obstacle(make_learner, make_rows):
+    """The first updates may come before every shard has had a block."""
+    learner, shards = make_learner(3)
+    shards[1].add(make_block(make_rows(40)))
+    assert learner.update(2, RATE).version == 2
+    shards[0].add(make_block(make_rows(40)))
+    shards[2].add(make_block(make_rows(40)))
+    assert learner.update(2, RATE).version == 4
+
+
+@pytest.mark.parametrize("num_shards", [1, 3])
+def test_a_saved_node_goes_on_bit_by_bit(tmp_path, make_learner, make_rows, num_shards):
+    learner, shards = make_learner(num_shards)
+    for sequence in range(6):
+        learner.add(make_block(make_rows(30, seed=sequence), sequence))
+    learner.update(4, RATE)
+    state = json.loads(json.dumps(learner.save(tmp_path)))
+    expected = [learner.update(4, RATE) for _ in range(2)]
+    resumed, again = make_learner(num_shards, seed=99)
+    weights = resumed.load(tmp_path, state)
+    assert weights[0].value.version == 4
+    for report in expected:
+        other = resumed.update(4, RATE)
+        assert (other.stats, other.version) == (report.stats, report.version)
+        for first, second in zip(other.weights[0].value.arrays, report.weights[0].value.arrays, strict=True):
+            np.testing.assert_array_equal(first, second)
+    assert [shard.add(make_block(make_rows(1), 9)).weights_version for shard in again] == [12] * num_shards
+
+
+def test_a_loaded_node_publishes_its_weights(tmp_path, make_learner, make_rows):
+    learner, (shard,) = make_learner()
+    shard.add(make_block(make_rows(30)))
+    learner.update(4, RATE)
+    state = learner.save(tmp_path)
+    resumed, (again,) = make_learner()
+    weights = resumed.load(tmp_path, state)
+    assert weights == resumed.weights() and weights[0].value.version == 4
+    assert again.add(make_block(make_rows(1), 9)).weights is weights[0]
+
+
+def test_another_number_of_shards_is_refused(tmp_path, make_learner, make_rows):
+    learner, _ = make_learner(2)
+    state = learner.save(tmp_path)
+    with pytest.raises(ValueError, match="2 shards, this run 3"):
+        make_learner(3)[0].load(tmp_path, state)
+
+
+@pytest.mark.parametrize("content", [None, b"damaged"])
+def test_a_damaged_file_is_refused(tmp_path, make_learner, content):
+    learner, _ = make_learner()
+    state = learner.save(tmp_path)
+    (tmp_path / "learner.safetensors").unlink()
+    if content is not None:
+        (tmp_path / "learner.safetensors").write_bytes(content)
+    with pytest.raises(ValueError, match="cannot be read"):
+        learner.load(tmp_path, state)
