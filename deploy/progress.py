@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from types import TracebackType
 from typing import Self
@@ -55,7 +56,7 @@ class PlainDisplay:
         self._total = total_env_steps
         self._latest = LatestMetrics()
         self._first: tuple[float, int] | None = None
-        self._last_s = 0.0
+        self._last_s = -math.inf
 
     def __enter__(self) -> Self:
         """Nothing to set up."""
@@ -87,7 +88,7 @@ class PlainDisplay:
 
     def message(self, text: str) -> None:
         """Prints a line."""
-        self._console.print(text, highlight=False, soft_wrap=True)
+        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 class LiveDisplay:
@@ -130,7 +131,7 @@ class LiveDisplay:
 
     def message(self, text: str) -> None:
         """Prints a line above the bar."""
-        self._progress.console.print(text, highlight=False)
+        self._progress.console.print(text, markup=False, highlight=False)
 
 
 def make_display(console: Console, total_env_steps: int) -> LiveDisplay | PlainDisplay:

@@ -11,6 +11,8 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
+from sim_core.checks import ConfigError
+
 
 class Row(NamedTuple):
     """Metrics of one moment: env steps, wall time in milliseconds, values by name."""
@@ -28,7 +30,7 @@ class Journal:
       offset: bytes that count; what a crashed run wrote after them is cut off.
 
     Raises:
-      ValueError: the file is shorter than `offset`.
+      ConfigError: the file is shorter than `offset`.
     """
 
     def __init__(self, path: Path, offset: int) -> None:
@@ -38,7 +40,9 @@ class Journal:
         length = self._file.seek(0, os.SEEK_END)
         if length < offset:
             self._file.close()
-            raise ValueError(f"{path} has {length} bytes, its checkpoint knows {offset}")
+            raise ConfigError(
+                f"{path} has {length} bytes, its checkpoint knows {offset}: put the whole file back or train anew"
+            )
         self._file.truncate(offset)
         self._file.seek(offset)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -121,23 +122,30 @@ def execute(
       How the run ended; the MLflow run is FINISHED, KILLED (stopped by a signal, resumable) or FAILED.
     """
     state = checkpoint.state if checkpoint else {"incarnation": -1, "journal_offset": 0}
-    journal = Journal(folder.journal, state["journal_offset"])
     status = "FAILED"
     try:
-        cluster = open_cluster(config, state["incarnation"] + 1, address)
-        result = _train(folder, config, tracker, display, checkpoint, journal, cluster)
-        cluster.close()  # after an error Ray closes at exit: references that the traceback holds outlive no earlier end
-        if result.evaluation is not None:
-            tracker.final(final_metrics(result.evaluation), journal.rows()[-1].time_ms)
-            finish(result, journal.rows())
+        with closing(Journal(folder.journal, state["journal_offset"])) as journal:
+            cluster = open_cluster(config, state["incarnation"] + 1, address)
+            result = _train(folder, config, tracker, display, checkpoint, journal, cluster)
+            cluster.close()  # not after an error: references in its traceback must not outlive Ray, which ends at exit
+            if result.evaluation is not None:
+                tracker.final(final_metrics(result.evaluation), journal.rows()[-1].time_ms)
+                finish(result, journal.rows())
         status = "FINISHED" if result.stopped_by is None else "KILLED"
         return result
     except KeyboardInterrupt:
         status = "KILLED"
         raise
     finally:
-        journal.close()
         tracker.end(status)
+
+
+def _restore(loop: TrainingLoop, checkpoint: Checkpoint) -> None:
+    try:
+        loop.restore(checkpoint)
+    except ValueError as error:
+        cause = getattr(error, "cause", error)  # what a Ray actor raised stands behind Ray's own error
+        raise CheckpointError(f"checkpoint {checkpoint.folder} does not fit this run: {cause}") from error
 
 
 def _train(
@@ -153,7 +161,7 @@ def _train(
     with stop_on_signals() as stop:
         loop = TrainingLoop(config, cluster, journal, folder.checkpoints, observer, stop)
         if checkpoint is not None:
-            loop.restore(checkpoint)
+            _restore(loop, checkpoint)
         finished = loop.run()
         if not finished:
             return RunResult(loop.env_steps, loop.updates, stop.signal, None, None)

@@ -88,7 +88,6 @@ def test_a_row_between_two_lines_still_counts(clock):
     assert "eval success 50%" in lines(console)[1]
 
 
-@pytest.mark.xfail(strict=True, reason="the last line counts as printed at 0 s: begin with -inf")
 def test_the_first_row_of_a_freshly_started_machine_is_shown(clock):
     clock[0] = 1.5
     console = make_console()
@@ -106,10 +105,6 @@ def test_messages_are_not_held_back_or_broken(clock):
     assert lines(console)[1:] == [long, "next"]
 
 
-MARKUP = pytest.mark.xfail(strict=True, reason="message() takes brackets for rich's markup: print with markup=False")
-
-
-@MARKUP
 @pytest.mark.parametrize("terminal", [False, True])
 @pytest.mark.parametrize("text", ["see /runs/one [shoal]", "odd [/path]"])
 def test_brackets_in_messages_are_shown(terminal, text):

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from learner.journal import Journal, PushedMark, Row
+from sim_core.checks import ConfigError
 
 ROWS = [Row(100 * i, 1_700_000_000_000 + i, {"a/b": i / 3, "c": float(i)}) for i in range(5)]
 
@@ -72,7 +73,7 @@ def test_a_fresh_start_drops_everything(path):
 
 def test_a_journal_shorter_than_its_checkpoint_knows_is_refused(path):
     offset = write(path, ROWS)
-    with pytest.raises(ValueError, match=str(offset + 1)):
+    with pytest.raises(ConfigError, match=str(offset + 1)):
         Journal(path, offset + 1)
     assert path.stat().st_size == offset
 
