@@ -61,7 +61,7 @@ class RunConfig:
     """Transitions that all shards hold together."""
     min_replay: int = 20_000
     """Transitions that must be stored before the first update."""
-    samples_per_insert: float = 4.0
+    samples_per_insert: float = 2.0
     """How often a stored transition is sampled on average (Reverb's rate limiter)."""
 
     algorithm: Literal["double_dqn", "dqn"] = "double_dqn"
