@@ -23,7 +23,7 @@ class Episode(NamedTuple):
     """One recorded episode of T env steps: T + 1 states, from the start to the ended one.
 
     Shapes: position, velocity `[T + 1, num_robots, 2]` float32 (metres, m/s); machine `[T + 1, num_robots]`
-    int8 (sim_core.flocking.STATE_NAMES); action `[T + 1]` int64 and reward `[T + 1]` float32, taken in and
+    int8 (sim_core.flock_rules.STATE_NAMES); action `[T + 1]` int64 and reward `[T + 1]` float32, taken in and
     received for the state of the same row (last row: -1 and 0); goal `[groups, 2]` float32.
     """
 

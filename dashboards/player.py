@@ -17,7 +17,7 @@ import numpy as np
 
 from actors.trajectory import Episode
 from sim_core.config import WorldConfig
-from sim_core.flocking import STATE_NAMES
+from sim_core.flock_rules import STATE_NAMES
 from sim_core.outcomes import OUTCOME_NAMES, Outcome
 from sim_core.render import GOAL_HALF_SIDE_M, GROUP_COLOURS, view_half_m
 
@@ -65,7 +65,7 @@ def player_data(episode: Episode, config: WorldConfig) -> dict[str, Any]:
     """What the player draws, ready for JSON.
 
     `positions` holds `[T + 1, num_robots, 2]` little-endian int16 in units of `metres_per_unit`, `machine`
-    `[T + 1, num_robots]` uint8 (sim_core.flocking.STATE_NAMES), both base64.
+    `[T + 1, num_robots]` uint8 (sim_core.flock_rules.STATE_NAMES), both base64.
 
     Raises:
       ValueError: the positions are not finite, or are not of `config.num_robots` robots.

@@ -1,106 +1,35 @@
 """FL-ORCA's preferred velocity: cohesion, separation, alignment and the four-state machine.
 
 Algorithm 3 and Figure 2.2 of the dissertation, after F. R. Inacio, D. G. Macharet, L. Chaimowicz
-(FL-ORCA). The text names the terms and states but no weights; `published` takes those that the authors'
-lab has published since, `uniform` one weight per term in all states. ORCA turns the result into the
-robot's new velocity (`sim_core.orca`).
+(FL-ORCA). ORCA turns the result into the robot's new velocity (`sim_core.orca`).
 
 The machine looks at neighbours' flags. Worlds are order-free: flags are found in passes over the old
 state (sees another group and has a free view; follows a free robot; follows such a follower), never
-robot by robot. A robot cannot see another group, have a blocked view and stand in none of the rows
-below, so the rows are complete.
+robot by robot.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple
-
 import numpy as np
 
-from sim_core.config import WorldConfig
+from sim_core.flock_rules import (
+    ALIGNMENT,
+    COHESION,
+    FOLLOWER,
+    FOLLOWS_FOLLOWER,
+    FOLLOWS_FREE,
+    FREE,
+    LEADER,
+    PREFERRED,
+    RIGHT,
+    SEES,
+    SEPARATION,
+    SINGLE_GROUP,
+    TURN_RIGHT,
+    VISION_FREE,
+)
 from sim_core.jit import kernel
 from sim_core.rng import uniform
-
-SINGLE_GROUP, VISION_FREE, FOLLOWER, TURN_RIGHT = 0, 1, 2, 3
-STATE_NAMES = ("single group", "vision free", "follower", "turn right")
-
-SEES, FREE, FOLLOWS_FREE, FOLLOWS_FOLLOWER = 1, 2, 4, 8
-"""Bits of a robot's flags: sees another group, free view, level-1 follower, level-2 follower."""
-
-COHESION, SEPARATION, ALIGNMENT, PREFERRED, LEADER, RIGHT = range(6)
-PUBLISHED_WEIGHTS = {
-    # (state, sees another group): cohesion, separation, alignment, preferred, leader, right
-    (SINGLE_GROUP, False): (1.0, 0.0, 1.0, 1.0, 0.0, 0.0),
-    (VISION_FREE, True): (15.0, 0.5, 5.0, 0.35, 0.0, 0.0),
-    (FOLLOWER, False): (10.0, 0.0, 0.0, 1.0, 50.0, 0.0),
-    (FOLLOWER, True): (15.0, 0.5, 0.0, 0.0, 50.0, 0.0),
-    (TURN_RIGHT, False): (15.0, 0.0, 2.0, 1.0, 0.0, 50.0),
-    (TURN_RIGHT, True): (50.0, 0.5, 1.0, 0.0, 0.0, 15.0),
-}
-
-
-class FlockParams(NamedTuple):
-    """The flock's constants in the worlds' dtype; weights `[state, sees, term]`."""
-
-    published: bool
-    weights: Any
-    robots: int
-    separation_range_sq: Any
-    separation_cos: Any
-    separation_noise: Any
-    sight_range_sq: Any
-    sight_cos: Any
-    view_range_sq: Any
-    view_cos: Any
-    uniform_separation_range_m: Any
-    uniform_view_corridor_m: Any
-    uniform_slow_radius_m: Any
-    max_speed_m_s: Any
-    zero: Any
-    one: Any
-
-
-def flock_weights(config: WorldConfig, dtype: Any) -> np.ndarray:
-    """Weights `[4, 2, 6]` (state, sees another group, term) of `config.flocking`."""
-    weights = np.zeros((4, 2, 6), dtype)
-    if config.flocking == "published":
-        for (state, sees), row in PUBLISHED_WEIGHTS.items():
-            weights[state, int(sees)] = row
-        return weights
-    weights[:, :, COHESION] = config.cohesion_weight
-    weights[:, :, SEPARATION] = config.separation_weight
-    weights[:, :, ALIGNMENT] = config.alignment_weight
-    for state, term in ((SINGLE_GROUP, PREFERRED), (VISION_FREE, PREFERRED), (FOLLOWER, LEADER), (TURN_RIGHT, RIGHT)):
-        weights[state, :, term] = 1.0
-    return weights
-
-
-def flock_params(config: WorldConfig, dtype: Any) -> FlockParams:
-    """The flock's constants of `config`, each a scalar of `dtype`."""
-    real = np.dtype(dtype).type
-
-    def cosine(angle_deg: float) -> Any:
-        return real(0.0 if angle_deg == 90.0 else math.cos(math.radians(angle_deg)))
-
-    return FlockParams(
-        published=config.flocking == "published",
-        weights=flock_weights(config, dtype),
-        robots=config.robots,
-        separation_range_sq=real(config.separation_range_m) ** 2,
-        separation_cos=cosine(config.separation_angle_deg),
-        separation_noise=real(config.separation_noise),
-        sight_range_sq=real(config.sight_range_m) ** 2,
-        sight_cos=cosine(config.sight_angle_deg),
-        view_range_sq=real(config.view_range_m) ** 2,
-        view_cos=cosine(config.view_angle_deg),
-        uniform_separation_range_m=real(config.uniform_separation_range_m),
-        uniform_view_corridor_m=real(config.uniform_view_corridor_m),
-        uniform_slow_radius_m=real(config.uniform_slow_radius_m),
-        max_speed_m_s=real(config.max_speed_m_s),
-        zero=real(0),
-        one=real(1),
-    )
 
 
 @kernel

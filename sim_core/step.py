@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sim_core.config import WorldConfig
-from sim_core.flocking import FlockParams, flock_params, preferred_velocities
+from sim_core.flock_rules import FlockParams, flock_params
+from sim_core.flocking import preferred_velocities
 from sim_core.jit import kernel
 from sim_core.neighbours import find_neighbours
 from sim_core.orca import ORCAParams, orca_params, orca_velocity

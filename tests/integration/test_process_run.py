@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-import subprocess
-import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -16,7 +14,7 @@ from learner.checkpoint import newest_valid
 from learner.cluster import process_cluster
 from learner.journal import Journal
 from learner.loop import TrainingLoop
-from tests.integration.conftest import clean_environment, flags
+from tests.integration.conftest import flags
 
 CLOCKED = ("speed/", "system/", "policy/staleness_s")
 """Metrics that depend on the clock."""
@@ -87,24 +85,17 @@ def test_another_seed_is_another_run(small, tmp_path):
 
 
 @pytest.mark.parametrize("shards", [1, 3])
-def test_a_run_resumed_in_a_new_process_is_the_uninterrupted_one(small, tmp_path, shards):
+def test_a_run_resumed_in_a_new_process_is_the_uninterrupted_one(small, shoal, tmp_path, shards):
     whole = dataclasses.replace(small, replay_shards=shards, workers=2, replay_capacity=4_200)
     half = dataclasses.replace(whole, total_env_steps=3_072)
     train(whole, tmp_path / "whole")
 
-    def run(*arguments):
-        done = subprocess.run(
-            [sys.executable, "-m", "deploy", *arguments],
-            cwd=tmp_path,
-            env=clean_environment(),
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+    for arguments in (
+        ("train", "--name", "halves", *flags(half)),
+        ("resume", "halves", "--total-env-steps", str(whole.total_env_steps)),
+    ):
+        done = shoal(*arguments)
         assert done.returncode == 0, done.stderr
-
-    run("train", "--name", "halves", *flags(half))
-    run("resume", "halves", "--total-env-steps", str(whole.total_env_steps))
     halves = final_state(tmp_path / "runs" / "halves")
     assert halves[1]["env_steps"] >= 2 * 3_000
     assert_same(final_state(tmp_path / "whole"), halves)

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from sim_core.flocking import flock_params, preferred_velocities
+from sim_core.flock_rules import flock_params
+from sim_core.flocking import preferred_velocities
 from sim_core.neighbours import find_neighbours
 from sim_core.state import empty_scratch, empty_state
 

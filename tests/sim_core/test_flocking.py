@@ -11,15 +11,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sim_core.config import WorldConfig
-from sim_core.flocking import (
-    FOLLOWER,
-    SINGLE_GROUP,
-    TURN_RIGHT,
-    VISION_FREE,
-    flock_params,
-    flock_terms,
-    weighted_sum,
-)
+from sim_core.flock_rules import FOLLOWER, SINGLE_GROUP, TURN_RIGHT, VISION_FREE, flock_params
+from sim_core.flocking import flock_terms, weighted_sum
 
 REAL = np.float32
 GOALS = [(20.0, 0.0), (-200.0, 0.0), (0.0, 200.0)]

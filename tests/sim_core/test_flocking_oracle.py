@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sim_core.config import WorldConfig
-from sim_core.flocking import FOLLOWER, SINGLE_GROUP, TURN_RIGHT, VISION_FREE
+from sim_core.flock_rules import FOLLOWER, SINGLE_GROUP, TURN_RIGHT, VISION_FREE
 
 ROBOTS, GROUPS = 6, 3
 EDGE = 2e-4
