@@ -34,20 +34,17 @@ def _plain(estimate: Estimate, digits: int) -> tuple[str, str]:
     return f"{estimate.value:.{digits}f}", f"{estimate.low:.{digits}f} … {estimate.high:.{digits}f}"
 
 
-def summary_table(folder: RunFolder, result: RunResult, tracking_uri: str, is_swarm: bool) -> Table:
-    """What a finished run left behind, and how to look at it."""
-    table = Table(show_header=False, box=None)
-    table.add_column(style="bold")
-    table.add_column(overflow="fold")
+def summary_lines(folder: RunFolder, result: RunResult, tracking_uri: str, is_swarm: bool) -> list[str]:
+    """What a finished run left behind, and how to look at it; lines, so that paths can be copied whole."""
     checkpoint, _ = newest_valid(folder.checkpoints)
-    animation = "episode.html" if is_swarm else "episode.mp4"
-    table.add_row("trained", f"{result.env_steps:,} env steps, {result.updates:,} updates")
-    table.add_row("checkpoint", str(checkpoint.folder))
-    table.add_row("curve", str(folder.artifacts / "learning_curve.png"))
-    table.add_row("animation", str(folder.artifacts / animation))
+    lines = {
+        "trained": f"{result.env_steps:,} env steps, {result.updates:,} updates",
+        "checkpoint": str(checkpoint.folder),
+        "curve": str(folder.artifacts / "learning_curve.png"),
+        "animation": str(folder.artifacts / ("episode.html" if is_swarm else "episode.mp4")),
+        "MLflow UI": tracking_uri,
+        "evaluate": f"shoal evaluate {shlex.quote(str(folder.path))}",
+    }
     if tracking_uri.startswith("sqlite:"):
-        table.add_row("MLflow UI", f"mlflow ui --backend-store-uri {shlex.quote(tracking_uri)}")
-    else:
-        table.add_row("MLflow", tracking_uri)
-    table.add_row("evaluate", f"shoal evaluate {shlex.quote(str(folder.path))}")
-    return table
+        lines["MLflow UI"] = f"mlflow ui --backend-store-uri {shlex.quote(tracking_uri)}"
+    return [f"{name:<11}{text}" for name, text in lines.items()]

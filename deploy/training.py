@@ -14,7 +14,7 @@ from actors.vector_env import env_shape
 from deploy.artifacts import log_artifacts
 from deploy.options import Launch, Resume, Train, ray_address
 from deploy.progress import make_display
-from deploy.tables import evaluation_table, summary_table
+from deploy.tables import evaluation_table, summary_lines
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.journal import Row
@@ -111,7 +111,8 @@ def _run(
         console.print(f"go on with: {resume_command(folder)}", highlight=False, soft_wrap=True)
         return 128 + (result.stopped_by or 0)
     console.print(evaluation_table(result.evaluation, run_name(config)))
-    console.print(summary_table(folder, result, tracker.uri, config.env.is_swarm), soft_wrap=True)
+    for line in summary_lines(folder, result, tracker.uri, config.env.is_swarm):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
     return 0
 
 
