@@ -15,7 +15,7 @@ from dashboards.video import episode_frames, write_mp4
 from learner.config import RunConfig
 from learner.journal import Row
 from learner.loop import FINAL_EVAL_SEED
-from learner.results import outcome_label
+from learner.results import as_metrics, outcome_label
 from learner.run import RunResult
 from learner.run_folder import RunFolder
 from learner.tracker import Tracker
@@ -30,17 +30,23 @@ def log_artifacts(folder: RunFolder, config: RunConfig, tracker: Tracker, result
     """Makes all artifacts of a finished run and uploads them."""
     assert result.weights is not None
     folder.artifacts.mkdir(exist_ok=True)
-    made = [folder.path / "config.json", _curve(folder, config, rows)]
+    made = [folder.path / "config.json", _curve(folder, config, [*rows, _last_row(result)])]
     if config.env.is_swarm:
         made += _swarm_animation(folder, config, result.weights)
     else:
         made += foreign_animation(config, result.weights, FINAL_EVAL_SEED, folder.artifacts / "episode.mp4")
     for path in made:
-        if path.exists():
-            tracker.artifact(path)
+        tracker.artifact(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # MLflow's own, about its schema inference
         tracker.log_policy(result.weights, config, env_shape(config.env))
+
+
+def _last_row(result: RunResult) -> Row:
+    """The evaluation at the end, as the curve's last point."""
+    assert result.evaluation is not None
+    metrics = {f"eval/{name}": value for name, value in as_metrics(result.evaluation).items()}
+    return Row(result.env_steps, 0, metrics)
 
 
 def curve_points(rows: list[Row]) -> list[CurvePoint]:
@@ -64,8 +70,6 @@ def curve_points(rows: list[Row]) -> list[CurvePoint]:
 def _curve(folder: RunFolder, config: RunConfig, rows: list[Row]) -> Path:
     path = folder.artifacts / "learning_curve.png"
     points = curve_points(rows)
-    if not points:
-        return path
     is_share = points[0].failures is not None
     title = f"{config.world.method} {config.world.setup}" if config.env.is_swarm else config.env_id
     learning_curve_png(points, path, title, "success rate" if is_share else "mean return", is_share)

@@ -104,11 +104,11 @@ class TrainingLoop:
             self._send_first_weights()
         self._meters.start_clock()
         while self.env_steps < self._config.total_env_steps and not self._stop():
+            if self._is_due("eval", self._config.eval_every_env_steps):
+                self._start_evaluation()  # after the last round's checkpoint, which would wait for it
             self._start_collects()  # act, step, store: the workers push to the shards
             self._start_updates()  # sample, update, publish: when the pacer says so
             self._take_results()
-            if self._is_due("eval", self._config.eval_every_env_steps):
-                self._start_evaluation()
             if self._is_due("log", self._config.log_every_env_steps):
                 self._write_row(self._meters.row(self._replay_size(), self._pacer.ratio()))
             if self._is_due("checkpoint", self._config.checkpoint_every_env_steps):
