@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.calls import Calls, Ref
 from actors.network import Policy, WeightsSnapshot
 from actors.rollout import join_stats
 from actors.trajectory import Episode
@@ -28,6 +29,16 @@ def evaluate(spec: EnvSpec, weights: WeightsSnapshot, seeds: list[int]) -> Episo
     policy = Policy(weights)
     chunks = [seeds[i : i + MAX_ENVS] for i in range(0, len(seeds), MAX_ENVS)]
     return join_stats([_play(spec, policy, chunk) for chunk in chunks])
+
+
+def evaluate_in_parts(calls: Calls, spec: EnvSpec, weights: Ref, seeds: list[int], parts: int) -> EpisodeStats:
+    """`evaluate` as up to `parts` calls at once; `weights` refers to a WeightsSnapshot.
+
+    Returns:
+      One entry a seed; their order is not that of the seeds.
+    """
+    refs = [calls.run(evaluate, spec, weights, seeds[i::parts]) for i in range(min(parts, len(seeds)))]
+    return join_stats([calls.get(ref) for ref in refs])
 
 
 def _play(spec: EnvSpec, policy: Policy, seeds: list[int]) -> EpisodeStats:

@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from actors.calls import Ref
-from actors.evaluator import evaluate
+from actors.evaluator import evaluate, evaluate_in_parts
 from actors.exploration import epsilon
 from actors.network import WeightsSnapshot
-from actors.rollout import join_stats
 from actors.transitions import BlockReport, EpisodeStats
 from learner.checkpoint import Checkpoint, keep_newest, write_checkpoint
 from learner.cluster import Cluster
@@ -255,11 +254,9 @@ class TrainingLoop:
 
     def final_evaluation(self) -> Evaluation:
         """Evaluates the newest weights over `final_eval_episodes`, in parallel tasks."""
-        count, tasks = self._config.final_eval_episodes, self._cluster.eval_tasks
-        seeds = list(range(FINAL_EVAL_SEED, FINAL_EVAL_SEED + count))
-        parts = [seeds[i::tasks] for i in range(min(tasks, count))]
-        refs = [self._calls.run(evaluate, self._config.env, self._weights, part) for part in parts]
-        return summarise(join_stats([self._calls.get(ref) for ref in refs]))
+        seeds = list(range(FINAL_EVAL_SEED, FINAL_EVAL_SEED + self._config.final_eval_episodes))
+        parts = self._cluster.eval_tasks
+        return summarise(evaluate_in_parts(self._calls, self._config.env, self._weights, seeds, parts))
 
     def newest_weights(self) -> WeightsSnapshot:
         """The weights that `final_evaluation` plays."""

@@ -15,10 +15,9 @@ import ray
 from ray.actor import ActorHandle
 
 from actors.calls import LocalCalls, Node, Ref
-from actors.evaluator import evaluate
+from actors.evaluator import evaluate_in_parts
 from actors.network import WeightsSnapshot
 from actors.nodes import RolloutNode, ShardNode
-from actors.rollout import join_stats
 from actors.transitions import EpisodeStats
 from actors.vector_env import EnvSpec, env_shape
 from learner.cluster import Cluster, learner_settings, rollout_settings, shard_settings
@@ -96,6 +95,10 @@ def cpus_needed(config: RunConfig) -> int:
     return config.workers + shards + 1
 
 
+def _cluster_cpus() -> int:
+    return int(ray.cluster_resources().get("CPU", 0))
+
+
 def connect(cpus: int, address: str | None) -> None:
     """Joins the cluster at `address`, or starts Ray on this machine with room for `cpus` CPU slots.
 
@@ -111,7 +114,7 @@ def connect(cpus: int, address: str | None) -> None:
         ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
     except ConnectionError as error:
         raise ConfigError(f"no Ray cluster answers at {address!r}; start one with `ray start --head`") from error
-    have = int(ray.cluster_resources().get("CPU", 0))
+    have = _cluster_cpus()
     if have < cpus:
         ray.shutdown()
         raise ConfigError(
@@ -128,10 +131,7 @@ def evaluate_in_tasks(spec: EnvSpec, weights: WeightsSnapshot, seeds: list[int],
     """
     connect(1, address)
     calls = RayCalls()
-    tasks = max(1, int(ray.cluster_resources().get("CPU", 1)))
-    shared = calls.put(weights)
-    refs = [calls.run(evaluate, spec, shared, seeds[i::tasks]) for i in range(min(tasks, len(seeds)))]
-    return join_stats([calls.get(ref) for ref in refs])
+    return evaluate_in_parts(calls, spec, calls.put(weights), seeds, _cluster_cpus())
 
 
 def ray_cluster(config: RunConfig, incarnation: int, address: str | None) -> Cluster:
@@ -157,6 +157,6 @@ def ray_cluster(config: RunConfig, incarnation: int, address: str | None) -> Clu
         collects_in_flight=COLLECTS_IN_FLIGHT,
         blocks_in_flight=config.workers * (COLLECTS_IN_FLIGHT + PUSHES_IN_FLIGHT),
         updates_in_flight=UPDATES_IN_FLIGHT,
-        eval_tasks=max(1, int(ray.cluster_resources().get("CPU", 1))),
+        eval_tasks=_cluster_cpus(),
         close=ray.shutdown,
     )

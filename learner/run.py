@@ -129,8 +129,9 @@ def execute(
             result = _train(folder, config, tracker, display, checkpoint, journal, cluster)
             cluster.close()  # not after an error: references in its traceback must not outlive Ray, which ends at exit
             if result.evaluation is not None:
-                tracker.final(final_metrics(result.evaluation), journal.rows()[-1].time_ms)
-                finish(result, journal.rows())
+                rows = journal.rows()
+                tracker.final(final_metrics(result.evaluation), rows[-1].time_ms)
+                finish(result, rows)
         status = "FINISHED" if result.stopped_by is None else "KILLED"
         return result
     except KeyboardInterrupt:
