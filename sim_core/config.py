@@ -71,8 +71,8 @@ class WorldConfig:
     neighbour_range_m: float = 1.5
     """Robots farther away are no neighbours."""
 
-    flocking: Literal["published", "uniform"] = "published"
-    """FL-ORCA weights: the published table per state, or one weight per term in all states."""
+    flocking: Literal["published", "uniform", "none"] = "published"
+    """FL-ORCA weights: the published table per state, one weight per term in all states, or ORCA alone."""
     separation_range_m: float = 0.395
     """`published`: other groups' robots within this range are separated from."""
     separation_angle_deg: float = 45.0

@@ -20,6 +20,9 @@ STATE_NAMES = ("single group", "vision free", "follower", "turn right")
 SEES, FREE, FOLLOWS_FREE, FOLLOWS_FOLLOWER = 1, 2, 4, 8
 """Bits of a robot's flags: sees another group, free view, level-1 follower, level-2 follower."""
 
+NO_FLOCK, PUBLISHED, UNIFORM = range(3)
+"""Rule sets: straight to the goal, the published table, one weight a term."""
+
 COHESION, SEPARATION, ALIGNMENT, PREFERRED, LEADER, RIGHT = range(6)
 PUBLISHED_WEIGHTS = {
     # (state, sees another group): cohesion, separation, alignment, preferred, leader, right
@@ -33,9 +36,9 @@ PUBLISHED_WEIGHTS = {
 
 
 class FlockParams(NamedTuple):
-    """The flock's constants in the worlds' dtype; weights `[state, sees, term]`."""
+    """The flock's constants in the worlds' dtype; weights `[state, sees, term]`, two unused terms last."""
 
-    published: bool
+    rules: int
     weights: Any
     robots: int
     separation_range_sq: Any
@@ -54,11 +57,11 @@ class FlockParams(NamedTuple):
 
 
 def flock_weights(config: WorldConfig, dtype: Any) -> np.ndarray:
-    """Weights `[4, 2, 6]` (state, sees another group, term) of `config.flocking`."""
-    weights = np.zeros((4, 2, 6), dtype)
+    """Weights `[4, 2, 8]` (state, sees another group, term, two unused) of `config.flocking`."""
+    weights = np.zeros((4, 2, 8), dtype)
     if config.flocking == "published":
         for (state, sees), row in PUBLISHED_WEIGHTS.items():
-            weights[state, int(sees)] = row
+            weights[state, int(sees), :6] = row
         return weights
     weights[:, :, COHESION] = config.cohesion_weight
     weights[:, :, SEPARATION] = config.separation_weight
@@ -76,7 +79,7 @@ def flock_params(config: WorldConfig, dtype: Any) -> FlockParams:
         return real(0.0 if angle_deg == 90.0 else math.cos(math.radians(angle_deg)))
 
     return FlockParams(
-        published=config.flocking == "published",
+        rules=("none", "published", "uniform").index(config.flocking),
         weights=flock_weights(config, dtype),
         robots=config.robots,
         separation_range_sq=real(config.separation_range_m) ** 2,

@@ -19,14 +19,27 @@ _TO_UNIT = 1.0 / 9007199254740992.0
 
 
 @kernel
-def uniform(state, world):
-    """Next float64 in [0, 1) of `state[world]` (uint64 `[num_worlds]`), which moves on by one draw."""
-    state[world] += _GOLDEN
-    z = state[world]
+def uniform_after(state, draws):
+    """The float64 in [0, 1) that `draws` (1 or more) draws from now gives, of a stream's uint64 `state`."""
+    z = state + np.uint64(draws) * _GOLDEN
     z = (z ^ (z >> _SHIFT_30)) * _MIX_1
     z = (z ^ (z >> _SHIFT_27)) * _MIX_2
     z = z ^ (z >> _SHIFT_31)
     return np.float64(z >> _SHIFT_11) * _TO_UNIT
+
+
+@kernel
+def skip(state, world, draws):
+    """Moves the stream `state[world]` on by `draws` draws."""
+    state[world] += np.uint64(draws) * _GOLDEN
+
+
+@kernel
+def uniform(state, world):
+    """Next float64 in [0, 1) of `state[world]` (uint64 `[num_worlds]`), which moves on by one draw."""
+    value = uniform_after(state[world], 1)
+    skip(state, world, 1)
+    return value
 
 
 def world_streams(seed: int, num_worlds: int) -> NDArray[np.uint64]:

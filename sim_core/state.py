@@ -30,22 +30,7 @@ class WorldState(NamedTuple):
     episode_return: Any
     rng: Any
     machine: Any
-
-
-class Scratch(NamedTuple):
-    """Work space of one world's step, reused by all worlds of the batch."""
-
-    neighbours: Any
-    counts: Any
-    distances_sq: Any
-    flags: Any
-    leaders: Any
-    pref_x: Any
-    pref_y: Any
-    new_vx: Any
-    new_vy: Any
-    lines: Any
-    projected: Any
+    reach_sq: Any
 
 
 def empty_state(config: WorldConfig, num_worlds: int, dtype: Any) -> WorldState:
@@ -64,22 +49,5 @@ def empty_state(config: WorldConfig, num_worlds: int, dtype: Any) -> WorldState:
         episode_return=np.zeros(num_worlds, np.float64),
         rng=np.zeros(num_worlds, np.uint64),
         machine=np.zeros(robots, np.int8),
-    )
-
-
-def empty_scratch(config: WorldConfig, dtype: Any) -> Scratch:
-    """Work space for one world of `config`."""
-    num_robots, k = config.num_robots, config.max_neighbours
-    return Scratch(
-        neighbours=np.zeros((num_robots, k), np.int32),
-        counts=np.zeros(num_robots, np.int32),
-        distances_sq=np.zeros(k, dtype),
-        flags=np.zeros(num_robots, np.uint8),
-        leaders=np.zeros(num_robots, np.int32),
-        pref_x=np.zeros(num_robots, dtype),
-        pref_y=np.zeros(num_robots, dtype),
-        new_vx=np.zeros(num_robots, dtype),
-        new_vy=np.zeros(num_robots, dtype),
-        lines=np.zeros((k, 4), dtype),
-        projected=np.zeros((k, 4), dtype),
+        reach_sq=np.full(robots, config.neighbour_range_m, dtype) ** 2,
     )

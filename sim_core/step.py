@@ -10,12 +10,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sim_core.config import WorldConfig
-from sim_core.flock_rules import FlockParams, flock_params
-from sim_core.flocking import preferred_velocities
-from sim_core.jit import kernel
-from sim_core.neighbours import find_neighbours
-from sim_core.orca import ORCAParams, orca_params, orca_velocity
+from sim_core.flock_rules import (
+    FOLLOWS_FOLLOWER,
+    FOLLOWS_FREE,
+    FREE,
+    NO_FLOCK,
+    PUBLISHED,
+    FlockParams,
+    flock_params,
+)
+from sim_core.flocking import clear_leaders, finish_separation, look, mark_followers, preferred_velocity
+from sim_core.jit import inlined, kernel
+from sim_core.lanes import LANES, any_lane, load, scatter, splat
+from sim_core.neighbours import NeighbourParams, find_neighbours, neighbour_params
+from sim_core.orca import ORCAParams, build_half_planes, orca_params, orca_velocity
+from sim_core.rng import skip, uniform_after
 from sim_core.scenario import start_world
+from sim_core.tile import worlds_per_tile
 
 
 class SwarmParams(NamedTuple):
@@ -23,91 +34,135 @@ class SwarmParams(NamedTuple):
 
     orca: ORCAParams
     flock: FlockParams
-    neighbour_range_sq: Any
+    near: NeighbourParams
     time_step_s: Any
+    nowhere: Any
     knows_learner: bool
+    robots: int
+    groups: int
+    tile_worlds: int
 
 
 def swarm_params(config: WorldConfig, dtype: Any) -> SwarmParams:
     """The swarm's constants of `config`."""
     real = np.dtype(dtype).type
+    drift_m = 2.0 * config.time_step_s * max(config.max_speed_m_s, config.learner_speed_m_s)
     return SwarmParams(
         orca=orca_params(config.orca_radius_m, config.orca_horizon_s, config.time_step_s, config.max_speed_m_s, dtype),
         flock=flock_params(config, dtype),
-        neighbour_range_sq=real(config.neighbour_range_m) ** 2,
+        near=neighbour_params(config.max_neighbours, config.neighbour_range_m, drift_m, dtype),
         time_step_s=real(config.time_step_s),
+        nowhere=real(np.nan),
         knows_learner=config.swarm_knows_learner,
+        robots=config.robots,
+        groups=config.groups,
+        tile_worlds=worlds_per_tile(config.num_robots),
     )
 
 
-@kernel
-def swarm_velocities(world, state, scratch, hidden, p):
-    """FL-ORCA's new velocities of all robots of one world, into `scratch.new_vx`, `scratch.new_vy`."""
-    pos_x, pos_y = state.pos_x[world], state.pos_y[world]
-    vel_x, vel_y = state.vel_x[world], state.vel_y[world]
-    for i in range(pos_x.shape[0]):
-        scratch.counts[i] = find_neighbours(
-            i, pos_x, pos_y, hidden, p.neighbour_range_sq, scratch.neighbours[i], scratch.distances_sq
-        )
-    preferred_velocities(
-        world,
-        pos_x,
-        pos_y,
-        vel_x,
-        vel_y,
-        state.goal_x[world],
-        state.goal_y[world],
-        scratch.neighbours,
-        scratch.counts,
-        scratch.flags,
-        scratch.leaders,
-        state.machine[world],
-        scratch.pref_x,
-        scratch.pref_y,
-        state.rng,
-        p.flock,
-    )
-    for i in range(pos_x.shape[0]):
-        scratch.new_vx[i], scratch.new_vy[i] = orca_velocity(
-            i,
-            pos_x,
-            pos_y,
-            vel_x,
-            vel_y,
-            scratch.neighbours[i],
-            scratch.counts[i],
-            scratch.pref_x[i],
-            scratch.pref_y[i],
-            scratch.lines,
-            scratch.projected,
-            p.orca,
-        )
+@inlined
+def _load_world(world, base, state, tile, p):
+    """Copies one world's old state into the tile, from slot `base` on."""
+    for group in range(p.groups):
+        goal_x, goal_y = state.goal_x[world, group], state.goal_y[world, group]
+        for i in range(group * p.robots, (group + 1) * p.robots):
+            slot = base + i
+            x, y = state.pos_x[world, i], state.pos_y[world, i]
+            to_x, to_y = goal_x - x, goal_y - y
+            tile.body[slot, 0], tile.body[slot, 1] = x, y
+            tile.body[slot, 2], tile.body[slot, 3] = state.vel_x[world, i], state.vel_y[world, i]
+            tile.aim[slot, 0], tile.aim[slot, 1], tile.aim[slot, 2] = to_x, to_y, to_x * to_x + to_y * to_y
+            tile.group[slot] = group
+            tile.seen_x[slot], tile.seen_y[slot] = x, y
+            tile.reach_sq[slot] = state.reach_sq[world, i]
+    if not p.knows_learner:
+        tile.seen_x[base + state.learner[world]] = p.nowhere
+
+
+@inlined
+def _separation_gain(row, first_world, apart, tile, rng, p):
+    """Gain of the published separation (a vector): 1 and a random part, one draw a robot."""
+    if not (p.flock.rules == PUBLISHED and p.flock.separation_noise > p.flock.zero and any_lane(apart > p.flock.zero)):
+        return splat(p.flock.one)
+    size = p.robots * p.groups
+    for lane in range(LANES):
+        slot = tile.order[row, lane]
+        world = min(first_world + slot // size, rng.shape[0] - 1)
+        tile.noise[lane] = uniform_after(rng[world], slot % size + 1)
+    return p.flock.one + p.flock.separation_noise * load(tile.noise, 0)
+
+
+@inlined
+def find_flock_terms(first_world, rows, tile, rng, p):
+    """All passes before the preferred velocities."""
+    for row in range(rows):
+        apart = look(row, tile, p.flock)
+        finish_separation(row, tile, apart, _separation_gain(row, first_world, apart, tile, rng, p), p.flock)
+        clear_leaders(row, tile)
+    for row in range(rows):
+        mark_followers(row, FREE, FOLLOWS_FREE, tile)
+    for row in range(rows):
+        mark_followers(row, FOLLOWS_FREE, FOLLOWS_FOLLOWER, tile)
+
+
+@inlined
+def tile_velocities(first_world, num_slots, rows, tile, rng, p):
+    """FL-ORCA's new velocities of all robots of a tile, into `tile.new_vx`, `tile.new_vy`."""
+    size = p.robots * p.groups
+    for row in range(rows):
+        find_neighbours(row, size, num_slots, tile, p.near)
+    if p.flock.rules != NO_FLOCK:
+        find_flock_terms(first_world, rows, tile, rng, p)
+    for row in range(rows):
+        robot, count = load(tile.order, row), tile.counts[row]
+        pref_x, pref_y = preferred_velocity(row, tile, p.flock)
+        build_half_planes(robot, tile.body, tile.neighbours, row * p.near.capacity, count, tile.lines, p.orca)
+        x, y = orca_velocity(tile.lines, count, pref_x, pref_y, tile.projected, p.orca)
+        scatter(tile.new_vx, robot, x)
+        scatter(tile.new_vy, robot, y)
+
+
+@inlined
+def _move_world(world, base, state, tile, command_x, command_y, piloted, p):
+    """Moves one world's robots with the tile's new velocities."""
+    if piloted:
+        tile.new_vx[base + state.learner[world]] = command_x[world]
+        tile.new_vy[base + state.learner[world]] = command_y[world]
+    for i in range(state.pos_x.shape[1]):
+        vx, vy = tile.new_vx[base + i], tile.new_vy[base + i]
+        state.vel_x[world, i], state.vel_y[world, i] = vx, vy
+        state.pos_x[world, i] += vx * p.time_step_s
+        state.pos_y[world, i] += vy * p.time_step_s
+        state.machine[world, i] = tile.machine[base + i]
+        state.reach_sq[world, i] = tile.reach_sq[base + i]
+    state.steps[world] += 1
+    if p.flock.rules == PUBLISHED and p.flock.separation_noise > p.flock.zero:
+        skip(state.rng, world, state.pos_x.shape[1])
 
 
 @kernel
-def advance(state, scratch, command_x, command_y, piloted, p):
+def advance(state, tile, command_x, command_y, piloted, p):
     """Moves every world by one step.
 
     Args:
       state: WorldState, changed in place.
-      scratch: Scratch.
+      tile: Tile.
       command_x, command_y: `[num_worlds]`, the learning robot's velocity, m/s.
       piloted: whether the learning robot obeys the command; else FL-ORCA drives it too.
       p: SwarmParams.
     """
-    for world in range(state.pos_x.shape[0]):
-        learner = state.learner[world]
-        hidden = -1 if p.knows_learner else learner
-        swarm_velocities(world, state, scratch, hidden, p)
-        if piloted:
-            scratch.new_vx[learner] = command_x[world]
-            scratch.new_vy[learner] = command_y[world]
-        for i in range(state.pos_x.shape[1]):
-            state.vel_x[world, i] = scratch.new_vx[i]
-            state.vel_y[world, i] = scratch.new_vy[i]
-            state.pos_x[world, i] += scratch.new_vx[i] * p.time_step_s
-            state.pos_y[world, i] += scratch.new_vy[i] * p.time_step_s
-        state.steps[world] += 1
+    num_worlds, size = state.pos_x.shape
+    for first in range(0, num_worlds, p.tile_worlds):
+        worlds = min(p.tile_worlds, num_worlds - first)
+        for i in range(worlds):
+            _load_world(first + i, i * size, state, tile, p)
+        num_slots = worlds * size
+        rows = (num_slots + LANES - 1) // LANES
+        for slot in range(num_slots, rows * LANES):
+            tile.body[slot, 0] = p.nowhere
+        tile_velocities(first, num_slots, rows, tile, state.rng, p)
+        for i in range(worlds):
+            _move_world(first + i, i * size, state, tile, command_x, command_y, piloted, p)
 
 
 @kernel

@@ -12,8 +12,9 @@ from sim_core.methods import make_method
 from sim_core.outcomes import Outcome
 from sim_core.rng import world_streams
 from sim_core.scenario import scenario_params
-from sim_core.state import WorldState, empty_scratch, empty_state
+from sim_core.state import WorldState, empty_state
 from sim_core.step import advance, restart, swarm_params
+from sim_core.tile import empty_tile, worlds_per_tile
 
 
 class StepResult(NamedTuple):
@@ -43,7 +44,9 @@ class WorldBatch:
         self.num_worlds = num_worlds
         self.method = make_method(config)
         self.state: WorldState = empty_state(config, num_worlds, np.float32)
-        self._scratch = empty_scratch(config, np.float32)
+        slots = min(worlds_per_tile(config.num_robots), num_worlds) * config.num_robots
+        rows = -(-slots // 8)
+        self._tile = empty_tile(rows * 8, rows, config.max_neighbours, np.float32)
         self._swarm = swarm_params(config, np.float32)
         self._scenario = scenario_params(config)
         self._command_x = np.zeros(num_worlds, np.float32)
@@ -87,9 +90,11 @@ class WorldBatch:
         Raises:
           ValueError: there is not one action a world, or one is none of the actions.
         """
-        if action is not None:
+        if action is None:
+            self.swarm_step()
+        else:
             self.method.velocity(self.state, action, self._command_x, self._command_y)
-        advance(self.state, self._scratch, self._command_x, self._command_y, action is not None, self._swarm)
+            advance(self.state, self._tile, self._command_x, self._command_y, True, self._swarm)
         self.method.outcome(self.state, self._outcome)
         self.method.reward(self.state, self._outcome, self._reward)
         self.method.perceive(self.state, self._all, self._observation)
@@ -100,6 +105,10 @@ class WorldBatch:
             self.state.steps.copy(),
             self.state.episode_return.copy(),
         )
+
+    def swarm_step(self) -> None:
+        """Moves every world by one step, the learning robot too, and nothing else: no outcome, no observation."""
+        advance(self.state, self._tile, self._command_x, self._command_y, False, self._swarm)
 
     def positions(self) -> NDArray[np.float32]:
         """Positions `[num_worlds, num_robots, 2]`, metres."""

@@ -1,25 +1,13 @@
 """Hand-made worlds for the tests of sim_core."""
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 
-from sim_core.flock_rules import flock_params
-from sim_core.flocking import preferred_velocities
-from sim_core.neighbours import find_neighbours
-from sim_core.state import empty_scratch, empty_state
+from sim_core.state import empty_state
+from sim_core.step import swarm_params
+from tests.sim_core.kernels import flock_of
 
 REAL = np.float32
-
-
-class Flock(NamedTuple):
-    """What `preferred_velocities` says about one world: velocity `[num_robots, 2]` and a robot's notes."""
-
-    velocity: np.ndarray
-    states: np.ndarray
-    flags: np.ndarray
-    leaders: np.ndarray
 
 
 def _make_state(config, pos, goals, vel=None, learner=0, seed=0):
@@ -34,37 +22,7 @@ def _make_state(config, pos, goals, vel=None, learner=0, seed=0):
 
 
 def _make_flock(config, pos, goals, vel=None, seed=0):
-    state, scratch = _make_state(config, pos, goals, vel, seed=seed), empty_scratch(config, REAL)
-    for i in range(config.num_robots):
-        scratch.counts[i] = find_neighbours(
-            i,
-            state.pos_x[0],
-            state.pos_y[0],
-            -1,
-            REAL(config.neighbour_range_m) ** 2,
-            scratch.neighbours[i],
-            scratch.distances_sq,
-        )
-    preferred_velocities(
-        0,
-        state.pos_x[0],
-        state.pos_y[0],
-        state.vel_x[0],
-        state.vel_y[0],
-        state.goal_x[0],
-        state.goal_y[0],
-        scratch.neighbours,
-        scratch.counts,
-        scratch.flags,
-        scratch.leaders,
-        state.machine[0],
-        scratch.pref_x,
-        scratch.pref_y,
-        state.rng,
-        flock_params(config, REAL),
-    )
-    velocity = np.stack([scratch.pref_x, scratch.pref_y], axis=-1)
-    return Flock(velocity, state.machine[0], scratch.flags, scratch.leaders)
+    return flock_of(pos, vel, goals, seed, swarm_params(config, REAL))
 
 
 @pytest.fixture(scope="session")

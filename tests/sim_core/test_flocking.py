@@ -12,7 +12,7 @@ from scipy import stats
 
 from sim_core.config import WorldConfig
 from sim_core.flock_rules import FOLLOWER, SINGLE_GROUP, TURN_RIGHT, VISION_FREE, flock_params
-from sim_core.flocking import flock_terms, weighted_sum
+from tests.sim_core.kernels import terms_of_robot_0, weighted_sum_of
 
 REAL = np.float32
 GOALS = [(20.0, 0.0), (-200.0, 0.0), (0.0, 200.0)]
@@ -200,12 +200,8 @@ def test_edges_of_separation(distance_m, angle_deg, acts, make_flock):
 
 def terms_of(pos, vel=None, noise=0.0, config=CONFIG):
     """Robot 0's (cohesion, separation, alignment), all others being its neighbours."""
-    pos = np.asarray(pos, REAL)
-    vel = np.zeros_like(pos) if vel is None else np.asarray(vel, REAL)
-    columns = [np.ascontiguousarray(column) for column in (*pos.T, *vel.T)]
-    others = np.arange(1, len(pos), dtype=np.int32)
-    out = flock_terms(0, *columns, REAL(20), REAL(0), others, len(others), REAL(noise), flock_params(config, REAL))
-    return np.array(out).reshape(3, 2)
+    vel = np.zeros((len(pos), 2)) if vel is None else vel
+    return terms_of_robot_0(pos, vel, (20, 0), 1 + noise, flock_params(config, REAL), config.robots)
 
 
 def test_terms_are_means_and_clipped():
@@ -262,12 +258,12 @@ def test_published_weights(state, sees, weights):
     for term in range(3):
         terms = [REAL(0)] * 6
         terms[2 * term + 1] = size
-        x, y = weighted_sum(state, sees, tuple(terms), *[REAL(0)] * 4, params)
+        x, y = weighted_sum_of(state, sees, terms, (0, 0), (0, 0), params)
         assert (x, y) == (0, pytest.approx(weights[term] * size))
     zeros = (REAL(0),) * 6
-    x, y = weighted_sum(state, sees, zeros, size, REAL(0), REAL(0), REAL(0), params)
+    x, y = weighted_sum_of(state, sees, zeros, (size, 0), (0, 0), params)
     assert (x, y) == (pytest.approx(weights[3] * size), pytest.approx(-weights[5] * size))
-    x, y = weighted_sum(state, sees, zeros, REAL(0), REAL(0), size, REAL(0), params)
+    x, y = weighted_sum_of(state, sees, zeros, (0, 0), (size, 0), params)
     assert (x, y) == (pytest.approx(weights[4] * size), 0)
 
 
@@ -279,12 +275,12 @@ def test_uniform_weights(state, sees, weights):
     for term in range(3):
         terms = zeros.copy()
         terms[2 * term] = REAL(1e-3)
-        x, y = weighted_sum(state, sees, tuple(terms), *[REAL(0)] * 4, params)
+        x, y = weighted_sum_of(state, sees, terms, (0, 0), (0, 0), params)
         assert (x, y) == (pytest.approx(weights[term] * 1e-3), 0)
     for goal_m, pref in ((5.0, 1.0), (0.25, 1.0), (0.1, 0.4), (0.0, 0.0)):  # slows down within 0.25 m
-        x, y = weighted_sum(state, sees, tuple(zeros), REAL(goal_m), REAL(0), REAL(0), REAL(0), params)
+        x, y = weighted_sum_of(state, sees, zeros, (goal_m, 0), (0, 0), params)
         assert (x, y) == (pytest.approx(weights[3] * pref), pytest.approx(-weights[5] * pref))
-    x, y = weighted_sum(state, sees, tuple(zeros), REAL(0), REAL(0), REAL(0), REAL(0.3), params)
+    x, y = weighted_sum_of(state, sees, zeros, (0, 0), (0, 0.3), params)
     assert (x, y) == (0, pytest.approx(weights[4]))  # the direction to the leader, however near
 
 

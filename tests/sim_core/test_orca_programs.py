@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from sim_core.orca import linear_program_2, linear_program_3, orca_params
+from sim_core.orca import orca_params
+from tests.sim_core.kernels import second_program, third_program
 
-PARAMS = orca_params(0.2, 2.0, 0.05, 1.0, np.float64)
 LIMIT = 1.3
+PARAMS = orca_params(0.2, 2.0, 0.05, LIMIT, np.float64)
 ATOL = 1e-6
 
 
@@ -84,14 +85,12 @@ def least_violation(lines, limit):
 
 def solve(lines, opt, direction_opt=False):
     """The second program's (failed row, velocity)."""
-    failed, x, y = linear_program_2(lines, len(lines), LIMIT, opt[0], opt[1], direction_opt, PARAMS)
-    return failed, np.array([x, y])
+    return second_program(lines, opt, direction_opt, PARAMS)
 
 
 def relax(lines, failed, v):
     """The third program's velocity."""
-    projected = np.zeros_like(lines)
-    return np.array(linear_program_3(lines, len(lines), failed, LIMIT, v[0], v[1], projected, PARAMS))
+    return third_program(lines, failed, v, PARAMS)
 
 
 def test_second_program_finds_the_nearest_permitted_velocity():

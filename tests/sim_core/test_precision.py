@@ -1,0 +1,34 @@
+"""What float32 costs: bounds for most robots, as ORCA has no bound for all.
+
+Where half-planes are nearly parallel, a rounding error turns the velocity that violates them least; RVO2's own
+float32 results are as far off there. In jams that spread doubles every few steps, so that no two arithmetics
+stay together for long. `tests.benchmarks.exactness` prints the whole distribution.
+"""
+
+import numpy as np
+import pytest
+
+from sim_core.config import WorldConfig
+from sim_core.worlds import WorldBatch
+from tests.sim_core.precision import drifts, one_step_difference
+from tests.sim_core.scenes import KINDS, numbered_scene, world_scene
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_float32_is_one_step_from_float64_up_to_rounding_for_most(kind):
+    errors = np.concatenate([one_step_difference(numbered_scene(kind, number)) for number in range(60)])
+    assert len(errors) > 2000
+    assert np.median(errors) < 3e-6 and np.quantile(errors, 0.9) < 1e-4
+
+
+@pytest.mark.parametrize(("robots", "groups"), [(5, 3), (10, 2), (25, 8)])
+def test_float32_drifts_from_float64_slowly(robots, groups):
+    worlds, found = WorldBatch(WorldConfig(robots=robots, groups=groups), 4), []
+    worlds.reset()
+    for step in range(200):
+        if step % 50 == 0:
+            found += [drifts(*world_scene(worlds, world)) for world in range(4)]
+        worlds.step(None)
+    after_1, after_10, _ = np.concatenate(found, axis=1)
+    assert np.median(after_1) < 5e-7 and np.quantile(after_1, 0.99) < 1e-5
+    assert np.median(after_10) < 5e-6 and np.quantile(after_10, 0.9) < 1e-3
