@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: train test bench lint setup clean
+.PHONY: train test bench bench-exactness lint setup clean
 
 setup: $(READY)
 
@@ -31,6 +31,10 @@ test: lint
 
 bench: $(READY)
 	$(BIN)/python -m tests.benchmarks $(ARGS)
+
+# How exact the simulator is: RVO2, float64, FL-ORCA's episodes. ARGS="--episodes 20 --scenes 800" for a short one.
+bench-exactness: $(READY)
+	$(BIN)/python -m tests.benchmarks.exactness $(ARGS)
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

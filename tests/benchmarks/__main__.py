@@ -1,24 +1,43 @@
-"""`make bench`: prints every benchmark's table; `make bench ARGS=simulator` prints one."""
+"""`make bench`: prints every benchmark's tables; `make bench ARGS=simulator` those of one."""
 
+import argparse
+import importlib
 import os
 import sys
+from pathlib import Path
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-from tests.benchmarks import replay, service, simulator  # noqa: E402
+from tests.benchmarks import simulator  # noqa: E402
 
-BENCHMARKS = {"simulator": simulator.main, "replay": replay.main, "service": service.main}
+BENCHMARKS = ("simulator", "replay", "service")
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
+    parser.add_argument("names", nargs="*", help=f"benchmarks to run, of {', '.join(BENCHMARKS)}; default: all")
+    parser.add_argument("--sections", nargs="+", choices=simulator.SECTIONS, help="parts of `simulator`; default: all")
+    parser.add_argument(
+        "--rvo2", type=Path, action="append", default=[], metavar="PATH", help="a built rvo2_driver; may be repeated"
+    )
+    options = parser.parse_args(arguments)
+    for name in options.names:
+        if name not in BENCHMARKS:
+            parser.error(f"no benchmark {name!r}; there are: {', '.join(BENCHMARKS)}")
+    for path in options.rvo2:
+        if not path.is_file():
+            parser.error(f"--rvo2: there is no file {path}")
+    return options
 
 
 def main() -> int:
-    names = sys.argv[1:] or list(BENCHMARKS)
-    unknown = [name for name in names if name not in BENCHMARKS]
-    if unknown:
-        print(f"no benchmark {unknown[0]!r}; there are: {', '.join(BENCHMARKS)}", file=sys.stderr)
-        return 2
-    for name in names:
-        BENCHMARKS[name]()
+    options = parse()
+    for name in options.names or BENCHMARKS:
+        if name == "simulator":
+            simulator.main(options.sections, [path.resolve() for path in options.rvo2])
+        else:  # imported here, as their libraries take seconds that the simulator's processes need not wait
+            importlib.import_module(f"tests.benchmarks.{name}").main()
     return 0
 
 

@@ -1,8 +1,10 @@
 """Interleaved timing: several rivals in turn in one run, so that ratios hold while the machine drifts."""
 
+import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 
@@ -17,23 +19,55 @@ class Spread(NamedTuple):
         return f"{self.median:,.{digits}f} ({self.low:,.{digits}f} … {self.high:,.{digits}f})"
 
 
+class Timed(NamedTuple):
+    """Work that was done and the time that counts for it."""
+
+    units: int
+    seconds: float
+
+
 def spread(values: list[float]) -> Spread:
     return Spread(min(values), statistics.median(values), max(values))
 
 
 def rates(rivals: dict[str, Callable[[], int]], rounds: int) -> dict[str, list[float]]:
     """Units of work a second of each rival, once a round, in turn; a first round warms up."""
+    return timed_rates({name: stopwatch(work) for name, work in rivals.items()}, rounds)
+
+
+def timed_rates(rivals: dict[str, Callable[[], Timed]], rounds: int) -> dict[str, list[float]]:
+    """As `rates`, for rivals that hold the watch themselves."""
     found: dict[str, list[float]] = {name: [] for name in rivals}
     for i in range(rounds + 1):
         for name, work in rivals.items():
-            start_s = time.perf_counter()
-            units = work()
-            elapsed_s = time.perf_counter() - start_s
+            units, seconds = work()
             if i:
-                found[name].append(units / elapsed_s)
+                found[name].append(units / seconds)
     return found
+
+
+def stopwatch(work: Callable[[], int]) -> Callable[[], Timed]:
+    """`work` with the time of the whole call."""
+
+    def timed() -> Timed:
+        start_s = time.perf_counter()
+        units = work()
+        return Timed(units, time.perf_counter() - start_s)
+
+    return timed
 
 
 def ratio(ours: list[float], theirs: list[float]) -> Spread:
     """Ours over theirs, round by round."""
     return spread([a / b for a, b in zip(ours, theirs, strict=True)])
+
+
+@contextmanager
+def pinned(core: int) -> Iterator[None]:
+    """Keeps this thread, and child processes that it starts, on one core within the `with` block."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {core})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
