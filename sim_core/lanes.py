@@ -184,6 +184,16 @@ def maximum(typingctx: Any, a: Any, b: Any) -> Any:
 
 
 @intrinsic
+def lane(typingctx: Any, vector: Any, i: Any) -> Any:
+    """The number in lane i."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.extract_element(args[0], context.cast(builder, args[1], sig.args[1], types.int32))
+
+    return vector.element(vector, i), lower
+
+
+@intrinsic
 def any_lane(typingctx: Any, mask: Any) -> Any:
     """Whether the mask is set in any lane."""
 

@@ -8,28 +8,47 @@ order of the candidates.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from sim_core.grid import band_of, column_of
 from sim_core.jit import inlined
-from sim_core.lanes import any_lane, gather, gather_4, load, maximum, minimum, root, scatter, select, splat, store
+from sim_core.lanes import (
+    LANES,
+    any_lane,
+    gather,
+    gather_4,
+    lane,
+    load,
+    maximum,
+    minimum,
+    root,
+    scatter,
+    select,
+    splat,
+    store,
+)
 
 
 class NeighbourParams(NamedTuple):
     """Constants of the search in the worlds' dtype."""
 
     capacity: int
+    grid: bool
     range_sq: Any
     drift_m: Any
     nowhere: Any
     infinity: Any
 
 
-def neighbour_params(capacity: int, range_m: float, drift_m: float, dtype: Any) -> NeighbourParams:
+def neighbour_params(
+    capacity: int, range_m: float, drift_m: float, dtype: Any, *, grid: bool = False
+) -> NeighbourParams:
     """Constants for `capacity` neighbours within `range_m` of robots that approach `drift_m` in a step at most."""
     real = np.dtype(dtype).type
-    return NeighbourParams(capacity, real(range_m) ** 2, real(drift_m), real(-1), real(np.inf))
+    return NeighbourParams(capacity, grid, real(range_m) ** 2, real(drift_m), real(-1), real(np.inf))
 
 
 @inlined
@@ -42,14 +61,23 @@ def clear_lists(reach_sq, distances, neighbours, at, capacity):
 
 
 @inlined
-def _insert(dist_sq, slot, filled, distances, neighbours, at):
+def _comes_before(dist_sq, slot, there_sq, there, ordered):
+    """Where a candidate belongs before a list's entry; of an ordered run, only if it is nearer."""
+    nearer = dist_sq < there_sq
+    if ordered:
+        return nearer
+    return nearer | ((dist_sq == there_sq) & (slot < there))
+
+
+@inlined
+def _insert(dist_sq, slot, filled, ordered, distances, neighbours, at):
     """Puts candidate `slot` into the lists where `dist_sq` is small enough; `filled` entries may change."""
     k = filled - 1
     here_sq, here = load(distances, k), load(neighbours, at + k)
-    before = (dist_sq < here_sq) | ((dist_sq == here_sq) & (slot < here))
+    before = _comes_before(dist_sq, slot, here_sq, here, ordered)
     while k > 0:
         next_sq, following = load(distances, k - 1), load(neighbours, at + k - 1)
-        before_next = (dist_sq < next_sq) | ((dist_sq == next_sq) & (slot < following))
+        before_next = _comes_before(dist_sq, slot, next_sq, following, ordered)
         store(distances, k, minimum(here_sq, maximum(next_sq, dist_sq)))
         store(neighbours, at + k, select(before_next, following, select(before, slot, here)))
         here_sq, here, before = next_sq, following, before_next
@@ -59,7 +87,7 @@ def _insert(dist_sq, slot, filled, distances, neighbours, at):
 
 
 @inlined
-def search(first, last, robot, inside, x, y, seen_x, seen_y, seen_slot, distances, neighbours, at, p):
+def search(first, last, robot, inside, x, y, tile, at, filled, ordered, p):
     """Puts those of the candidates `first` to `last - 1` that are near enough into the lists at `at`.
 
     Args:
@@ -67,24 +95,30 @@ def search(first, last, robot, inside, x, y, seen_x, seen_y, seen_slot, distance
       robot: int32 vector, the searching robots; none is its own neighbour.
       inside: mask of the robots that search here.
       x, y: vectors, their positions, metres.
-      seen_x, seen_y: `[candidates]`, positions, metres; NaN for one that nobody perceives.
-      seen_slot: `[candidates]` int32, their indices.
-      distances, neighbours, at: the lists, cleared or partly filled by earlier runs.
+      tile: Tile with seen_x, seen_y (metres; NaN for one that nobody perceives) and seen_slot of the candidates,
+        and the lists in distances and neighbours, cleared or partly filled by earlier runs.
+      at: vector of `tile.neighbours` where the lists begin.
+      filled: entries that earlier runs may have filled.
+      ordered: whether the slots of all runs ascend, so that the earlier of two equally far comes first anyhow.
       p: NeighbourParams.
+
+    Returns:
+      Entries that may be filled now.
     """
     nowhere = splat(p.nowhere)
-    limit_sq = select(inside, load(distances, p.capacity - 1), nowhere)
-    filled = 0
+    limit_sq = select(inside, load(tile.distances, p.capacity - 1), nowhere)
     for candidate in range(first, last):
-        dx, dy = x - seen_x[candidate], y - seen_y[candidate]
+        dx, dy = x - tile.seen_x[candidate], y - tile.seen_y[candidate]
         dist_sq = dx * dx + dy * dy
         near = dist_sq <= limit_sq
         if any_lane(near):
-            slot = splat(seen_slot[candidate])
+            slot = splat(tile.seen_slot[candidate])
             near = near & (robot != slot)
             filled = min(filled + 1, p.capacity)
-            _insert(select(near, dist_sq, p.infinity), slot, filled, distances, neighbours, at)
-            limit_sq = select(inside, load(distances, p.capacity - 1), nowhere)
+            dist_sq = select(near, dist_sq, p.infinity)
+            _insert(dist_sq, slot, filled, ordered, tile.distances, tile.neighbours, at)
+            limit_sq = select(inside, load(tile.distances, p.capacity - 1), nowhere)
+    return filled
 
 
 @inlined
@@ -119,22 +153,61 @@ def _search_worlds(row, size, num_slots, tile, p):
     last = min(tile.order[row, 7] + 1, num_slots)
     while first < last:
         inside = (robot >= first) & (robot < first + size)
-        search(
-            first,
-            first + size,
-            robot,
-            inside,
-            x,
-            y,
-            tile.seen_x,
-            tile.seen_y,
-            tile.seen_slot,
-            tile.distances,
-            tile.neighbours,
-            at,
-            p,
-        )
+        search(first, first + size, robot, inside, x, y, tile, at, 0, True, p)
         first += size
+
+
+@inlined
+def largest(vector):
+    """The largest of the eight numbers."""
+    best = lane(vector, 0)
+    for i in range(1, LANES):
+        best = max(best, lane(vector, i))
+    return best
+
+
+@inlined
+def body_box(row, num_slots, tile):
+    """(lowest x, highest x, lowest y, highest y) of a row's robots, metres."""
+    own = tile.order[row, 0]
+    low_x, high_x, low_y, high_y = tile.body[own, 0], tile.body[own, 0], tile.body[own, 1], tile.body[own, 1]
+    for i in range(1, LANES):
+        slot = tile.order[row, i]
+        if slot < num_slots:
+            low_x, high_x = min(low_x, tile.body[slot, 0]), max(high_x, tile.body[slot, 0])
+            low_y, high_y = min(low_y, tile.body[slot, 1]), max(high_y, tile.body[slot, 1])
+    return low_x, high_x, low_y, high_y
+
+
+@inlined
+def _search_cells(row, reach_sq, num_slots, tile, p):
+    """Searches, for a row's robots, the grid's cells within the largest of `reach_sq`."""
+    grid = tile.grid
+    robot = load(tile.order, row)
+    x, y, _, _ = gather_4(tile.body, robot)
+    own = tile.order[row, 0]
+    low_x, high_x, low_y, high_y = body_box(row, num_slots, tile)
+    # the margin covers rounding: a robot within reach must not lie in a cell outside
+    reach_m = math.sqrt(largest(reach_sq)) * 1.001 + 1e-6 * (abs(low_x) + abs(low_y) + 1.0)
+    left, right = column_of(low_x - reach_m, grid), column_of(high_x + reach_m, grid)
+    low, high = band_of(low_y - reach_m, grid), band_of(high_y + reach_m, grid)
+    middle = band_of(tile.body[own, 1], grid)
+    filled = 0
+    for step in range(2 * max(high - middle, middle - low) + 1):  # the own band first, then those on either side
+        band = middle + (step + 1) // 2 * (1 if step % 2 else -1)
+        if low <= band <= high:
+            first = grid.starts[band * grid.shape[0] + left]
+            last = grid.starts[band * grid.shape[0] + right + 1]
+            filled = search(first, last, robot, splat(True), x, y, tile, row * p.capacity, filled, False, p)
+
+
+@inlined
+def _search(row, reach_sq, size, num_slots, tile, p):
+    clear_lists(reach_sq, tile.distances, tile.neighbours, row * p.capacity, p.capacity)
+    if p.grid:
+        _search_cells(row, reach_sq, num_slots, tile, p)
+    else:
+        _search_worlds(row, size, num_slots, tile, p)
 
 
 @inlined
@@ -154,10 +227,8 @@ def find_neighbours(row, size, num_slots, tile, p):
     robot = load(tile.order, row)
     at = row * p.capacity
     reach_sq = gather(tile.reach_sq, robot)
-    clear_lists(reach_sq, tile.distances, tile.neighbours, at, p.capacity)
-    _search_worlds(row, size, num_slots, tile, p)
+    _search(row, reach_sq, size, num_slots, tile, p)
     if any_lane((load(tile.neighbours, at + p.capacity - 1) < 0) & (reach_sq < p.range_sq)):
-        clear_lists(splat(p.range_sq), tile.distances, tile.neighbours, at, p.capacity)
-        _search_worlds(row, size, num_slots, tile, p)
+        _search(row, splat(p.range_sq), size, num_slots, tile, p)
     remember_reach(robot, at, tile.distances, tile.neighbours, tile.reach_sq, p)
     tile.counts[row] = longest(tile.neighbours, at, p.capacity)

@@ -20,13 +20,14 @@ from sim_core.flock_rules import (
     flock_params,
 )
 from sim_core.flocking import clear_leaders, finish_separation, look, mark_followers, preferred_velocity
+from sim_core.grid import CELLS_PER_RANGE, arrange
 from sim_core.jit import inlined, kernel
 from sim_core.lanes import LANES, any_lane, load, scatter, splat
 from sim_core.neighbours import NeighbourParams, find_neighbours, neighbour_params
 from sim_core.orca import ORCAParams, build_half_planes, orca_params, orca_velocity
 from sim_core.rng import skip, uniform_after
 from sim_core.scenario import start_world
-from sim_core.tile import worlds_per_tile
+from sim_core.tile import GRID_FROM_ROBOTS, worlds_per_tile
 
 
 class SwarmParams(NamedTuple):
@@ -37,6 +38,7 @@ class SwarmParams(NamedTuple):
     near: NeighbourParams
     time_step_s: Any
     nowhere: Any
+    cell_edge_m: float
     knows_learner: bool
     robots: int
     groups: int
@@ -50,9 +52,12 @@ def swarm_params(config: WorldConfig, dtype: Any) -> SwarmParams:
     return SwarmParams(
         orca=orca_params(config.orca_radius_m, config.orca_horizon_s, config.time_step_s, config.max_speed_m_s, dtype),
         flock=flock_params(config, dtype),
-        near=neighbour_params(config.max_neighbours, config.neighbour_range_m, drift_m, dtype),
+        near=neighbour_params(
+            config.max_neighbours, config.neighbour_range_m, drift_m, dtype, grid=config.num_robots >= GRID_FROM_ROBOTS
+        ),
         time_step_s=real(config.time_step_s),
         nowhere=real(np.nan),
+        cell_edge_m=config.neighbour_range_m / CELLS_PER_RANGE,
         knows_learner=config.swarm_knows_learner,
         robots=config.robots,
         groups=config.groups,
@@ -73,10 +78,28 @@ def _load_world(world, base, state, tile, p):
             tile.body[slot, 2], tile.body[slot, 3] = state.vel_x[world, i], state.vel_y[world, i]
             tile.aim[slot, 0], tile.aim[slot, 1], tile.aim[slot, 2] = to_x, to_y, to_x * to_x + to_y * to_y
             tile.group[slot] = group
-            tile.seen_x[slot], tile.seen_y[slot] = x, y
+            if not p.near.grid:
+                tile.seen_x[slot], tile.seen_y[slot] = x, y
             tile.reach_sq[slot] = state.reach_sq[world, i]
+
+
+@inlined
+def _load_tile(first, worlds, state, tile, p):
+    """Copies the old state of `worlds` worlds into the tile and arranges the candidates; returns the rows."""
+    size = p.robots * p.groups
+    for i in range(worlds):
+        _load_world(first + i, i * size, state, tile, p)
+    if p.near.grid:
+        rows = arrange(size, tile, p.cell_edge_m)
+    else:
+        rows = (worlds * size + LANES - 1) // LANES
+        for slot in range(worlds * size, rows * LANES):
+            tile.body[slot, 0] = p.nowhere
     if not p.knows_learner:
-        tile.seen_x[base + state.learner[world]] = p.nowhere
+        for i in range(worlds):
+            learner = i * size + state.learner[first + i]
+            tile.seen_x[tile.grid.place[learner] if p.near.grid else learner] = p.nowhere
+    return rows
 
 
 @inlined
@@ -154,13 +177,8 @@ def advance(state, tile, command_x, command_y, piloted, p):
     num_worlds, size = state.pos_x.shape
     for first in range(0, num_worlds, p.tile_worlds):
         worlds = min(p.tile_worlds, num_worlds - first)
-        for i in range(worlds):
-            _load_world(first + i, i * size, state, tile, p)
-        num_slots = worlds * size
-        rows = (num_slots + LANES - 1) // LANES
-        for slot in range(num_slots, rows * LANES):
-            tile.body[slot, 0] = p.nowhere
-        tile_velocities(first, num_slots, rows, tile, state.rng, p)
+        rows = _load_tile(first, worlds, state, tile, p)
+        tile_velocities(first, worlds * size, rows, tile, state.rng, p)
         for i in range(worlds):
             _move_world(first + i, i * size, state, tile, command_x, command_y, piloted, p)
 

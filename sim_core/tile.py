@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sim_core.config import WorldConfig
+from sim_core.grid import Grid, empty_grid
 from sim_core.lanes import LANES
 
 
@@ -35,6 +37,7 @@ class Tile(NamedTuple):
     new_vx, new_vy: `[slots]`, m/s.
     machine: `[slots]` int32.
     noise: `[8]`.
+    grid: Grid, used in large worlds.
     """
 
     body: Any
@@ -58,11 +61,25 @@ class Tile(NamedTuple):
     new_vy: Any
     machine: Any
     noise: Any
+    grid: Grid
+
+
+GRID_FROM_ROBOTS = 150
+"""Worlds with at least as many robots are searched by grid; smaller ones robot by robot, which is faster there."""
 
 
 def worlds_per_tile(num_robots: int) -> int:
-    """Fewest worlds of `num_robots` that fill vectors of eight."""
-    return LANES // math.gcd(num_robots, LANES)
+    """Fewest worlds of `num_robots` that fill vectors of eight; one if they are searched by grid."""
+    return 1 if num_robots >= GRID_FROM_ROBOTS else LANES // math.gcd(num_robots, LANES)
+
+
+def world_tile(config: WorldConfig, num_worlds: int, dtype: Any) -> Tile:
+    """Work space for a batch of `num_worlds` worlds of `config`."""
+    size = config.num_robots
+    if size >= GRID_FROM_ROBOTS:  # a row may be cut after any robot
+        return empty_tile(size, size, config.max_neighbours, dtype)
+    rows = -(-min(worlds_per_tile(size), num_worlds) * size // LANES)
+    return empty_tile(rows * LANES, rows, config.max_neighbours, dtype)
 
 
 def empty_tile(num_slots: int, num_rows: int, max_neighbours: int, dtype: Any) -> Tile:
@@ -94,6 +111,7 @@ def empty_tile(num_slots: int, num_rows: int, max_neighbours: int, dtype: Any) -
         new_vy=np.zeros(slots, dtype),
         machine=whole(slots),
         noise=np.zeros(LANES, dtype),
+        grid=empty_grid(num_slots),
     )
     np.minimum(tile.order, num_slots, out=tile.order)
     return tile

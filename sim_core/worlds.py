@@ -14,7 +14,7 @@ from sim_core.rng import world_streams
 from sim_core.scenario import scenario_params
 from sim_core.state import WorldState, empty_state
 from sim_core.step import advance, restart, swarm_params
-from sim_core.tile import empty_tile, worlds_per_tile
+from sim_core.tile import world_tile
 
 
 class StepResult(NamedTuple):
@@ -44,9 +44,7 @@ class WorldBatch:
         self.num_worlds = num_worlds
         self.method = make_method(config)
         self.state: WorldState = empty_state(config, num_worlds, np.float32)
-        slots = min(worlds_per_tile(config.num_robots), num_worlds) * config.num_robots
-        rows = -(-slots // 8)
-        self._tile = empty_tile(rows * 8, rows, config.max_neighbours, np.float32)
+        self._tile = world_tile(config, num_worlds, np.float32)
         self._swarm = swarm_params(config, np.float32)
         self._scenario = scenario_params(config)
         self._command_x = np.zeros(num_worlds, np.float32)
