@@ -48,7 +48,7 @@ def _blocks_view(dx, dy, dist_sq, dist_m, goal_x, goal_y, goal_m, same_group, f)
 
 
 @inlined
-def look(row, tile, f):
+def look(row, at, tile, f):
     """First pass: a row's flags SEES and FREE, its flock terms, and its neighbours of the own group.
 
     Args:
@@ -70,7 +70,7 @@ def look(row, tile, f):
     own, apart = zero, zero
     free = splat(True)
     sees = ~free
-    at = row * tile.neighbours.shape[1]
+    mates = row * tile.mates.shape[1]
     for k in range(tile.counts[row]):
         other = load(tile.neighbours, at + k)
         present = other >= 0
@@ -84,7 +84,7 @@ def look(row, tile, f):
         ahead = dx * goal_x + dy * goal_y
         sees = sees | (other_group & (dist_sq < f.sight_range_sq) & (ahead > f.sight_cos * dist_m * goal_m))
         free = free & ~(present & _blocks_view(dx, dy, dist_sq, dist_m, goal_x, goal_y, goal_m, same_group, f))
-        store(tile.mates, at + k, select(same_group, other, robot))
+        store(tile.mates, mates + k, select(same_group, other, robot))
         own = own + select(same_group, f.one, zero)
         coh_x, coh_y = coh_x + select(same_group, dx, zero), coh_y + select(same_group, dy, zero)
         ali_x, ali_y = ali_x + select(same_group, other_vx, zero), ali_y + select(same_group, other_vy, zero)

@@ -37,7 +37,9 @@ class NeighbourParams(NamedTuple):
 
     capacity: int
     grid: bool
+    remembers: bool
     range_sq: Any
+    below_range_sq: Any
     drift_m: Any
     nowhere: Any
     infinity: Any
@@ -48,7 +50,16 @@ def neighbour_params(
 ) -> NeighbourParams:
     """Constants for `capacity` neighbours within `range_m` of robots that approach `drift_m` in a step at most."""
     real = np.dtype(dtype).type
-    return NeighbourParams(capacity, grid, real(range_m) ** 2, real(drift_m), real(-1), real(np.inf))
+    return NeighbourParams(
+        capacity,
+        grid,
+        not grid,
+        real(range_m) ** 2,
+        np.nextafter(real(range_m) ** 2, real(0)),
+        real(drift_m),
+        real(-1),
+        real(np.inf),
+    )
 
 
 @inlined
@@ -61,23 +72,20 @@ def clear_lists(reach_sq, distances, neighbours, at, capacity):
 
 
 @inlined
-def _comes_before(dist_sq, slot, there_sq, there, ordered):
-    """Where a candidate belongs before a list's entry; of an ordered run, only if it is nearer."""
-    nearer = dist_sq < there_sq
-    if ordered:
-        return nearer
-    return nearer | ((dist_sq == there_sq) & (slot < there))
+def _comes_before(dist_sq, slot, there_sq, there):
+    """Where a candidate belongs before a list's entry: nearer, or as near and of lower index."""
+    return (dist_sq < there_sq) | ((dist_sq == there_sq) & (slot < there))
 
 
 @inlined
-def _insert(dist_sq, slot, filled, ordered, distances, neighbours, at):
+def _insert(dist_sq, slot, filled, distances, neighbours, at):
     """Puts candidate `slot` into the lists where `dist_sq` is small enough; `filled` entries may change."""
     k = filled - 1
     here_sq, here = load(distances, k), load(neighbours, at + k)
-    before = _comes_before(dist_sq, slot, here_sq, here, ordered)
+    before = _comes_before(dist_sq, slot, here_sq, here)
     while k > 0:
         next_sq, following = load(distances, k - 1), load(neighbours, at + k - 1)
-        before_next = _comes_before(dist_sq, slot, next_sq, following, ordered)
+        before_next = _comes_before(dist_sq, slot, next_sq, following)
         store(distances, k, minimum(here_sq, maximum(next_sq, dist_sq)))
         store(neighbours, at + k, select(before_next, following, select(before, slot, here)))
         here_sq, here, before = next_sq, following, before_next
@@ -87,7 +95,7 @@ def _insert(dist_sq, slot, filled, ordered, distances, neighbours, at):
 
 
 @inlined
-def search(first, last, robot, inside, x, y, tile, at, filled, ordered, p):
+def search(first, last, robot, inside, x, y, tile, at, filled, p):
     """Puts those of the candidates `first` to `last - 1` that are near enough into the lists at `at`.
 
     Args:
@@ -99,7 +107,6 @@ def search(first, last, robot, inside, x, y, tile, at, filled, ordered, p):
         and the lists in distances and neighbours, cleared or partly filled by earlier runs.
       at: vector of `tile.neighbours` where the lists begin.
       filled: entries that earlier runs may have filled.
-      ordered: whether the slots of all runs ascend, so that the earlier of two equally far comes first anyhow.
       p: NeighbourParams.
 
     Returns:
@@ -114,9 +121,14 @@ def search(first, last, robot, inside, x, y, tile, at, filled, ordered, p):
         if any_lane(near):
             slot = splat(tile.seen_slot[candidate])
             near = near & (robot != slot)
+            if p.remembers:
+                for k in range(filled):
+                    near = near & (load(tile.neighbours, at + k) != slot)
+                if not any_lane(near):
+                    continue
             filled = min(filled + 1, p.capacity)
             dist_sq = select(near, dist_sq, p.infinity)
-            _insert(dist_sq, slot, filled, ordered, tile.distances, tile.neighbours, at)
+            _insert(dist_sq, slot, filled, tile.distances, tile.neighbours, at)
             limit_sq = select(inside, load(tile.distances, p.capacity - 1), nowhere)
     return filled
 
@@ -144,16 +156,76 @@ def longest(neighbours, at, capacity):
 
 
 @inlined
-def _search_worlds(row, size, num_slots, tile, p):
+def _refresh(robot, x, y, tile, at, p):
+    """Brings the lists at `at` from the step before up to date: new distances, sorted again.
+
+    Neighbours that are out of range or have become invisible leave. Returns the entries of the longest list.
+    """
+    count = longest(tile.neighbours, at, p.capacity)
+    nobody = splat(-1)
+    for k in range(count):
+        other = load(tile.neighbours, at + k)
+        known = select(other >= 0, other, robot)
+        dx, dy = x - gather(tile.seen_x, known), y - gather(tile.seen_y, known)
+        dist_sq = dx * dx + dy * dy
+        stays = (other >= 0) & (dist_sq < p.range_sq)
+        store(tile.distances, k, select(stays, dist_sq, p.range_sq))
+        store(tile.neighbours, at + k, select(stays, other, nobody))
+    for k in range(count, p.capacity):
+        store(tile.distances, k, splat(p.range_sq))
+    while _sort_pass(count, tile, at):
+        pass
+    return count
+
+
+@inlined
+def _sort_pass(count, tile, at):
+    """Carries the farthest of each list to its end; returns whether anything has moved."""
+    moved = ~splat(True)
+    far_sq, far = load(tile.distances, 0), load(tile.neighbours, at)
+    for k in range(1, count):
+        next_sq, following = load(tile.distances, k), load(tile.neighbours, at + k)
+        swap = (next_sq < far_sq) | ((next_sq == far_sq) & (following < far))
+        moved = moved | swap
+        store(tile.distances, k - 1, select(swap, next_sq, far_sq))
+        store(tile.neighbours, at + k - 1, select(swap, following, far))
+        far_sq, far = select(swap, far_sq, next_sq), select(swap, far, following)
+    if count > 0:
+        store(tile.distances, count - 1, far_sq)
+        store(tile.neighbours, at + count - 1, far)
+    return any_lane(moved)
+
+
+@inlined
+def _count_within(first, last, limit_sq, x, y, tile):
+    """How many of the candidates lie within `limit_sq` (inclusive; NaN for robots that do not ask)."""
+    hits = splat(0)
+    for candidate in range(first, last):
+        dx, dy = x - tile.seen_x[candidate], y - tile.seen_y[candidate]
+        hits = hits + select(dx * dx + dy * dy <= limit_sq, 1, splat(0))
+    return hits
+
+
+@inlined
+def _search_worlds(row, at, size, num_slots, tile, p):
     """Searches, for a row's robots, the worlds of `size` robots that they are in."""
     robot = load(tile.order, row)
     x, y, _, _ = gather_4(tile.body, robot)
-    at = row * p.capacity
+    count = _refresh(robot, x, y, tile, at, p)
+    entries = splat(0)
+    for k in range(count):
+        entries = entries + select(load(tile.neighbours, at + k) >= 0, 1, splat(0))
+    seen = gather(tile.seen_x, robot)
+    entries = entries + select(seen == seen, 1, splat(0))
+    limit_sq = minimum(load(tile.distances, p.capacity - 1), splat(p.below_range_sq))
     first = tile.order[row, 0] // size * size
     last = min(tile.order[row, 7] + 1, num_slots)
     while first < last:
         inside = (robot >= first) & (robot < first + size)
-        search(first, first + size, robot, inside, x, y, tile, at, 0, True, p)
+        hits = _count_within(first, first + size, select(inside, limit_sq, p.nowhere), x, y, tile)
+        asks = inside & (hits != entries)
+        if any_lane(asks):
+            search(first, first + size, robot, asks, x, y, tile, at, count, p)
         first += size
 
 
@@ -180,9 +252,10 @@ def body_box(row, num_slots, tile):
 
 
 @inlined
-def _search_cells(row, reach_sq, num_slots, tile, p):
+def _search_cells(row, at, reach_sq, num_slots, tile, p):
     """Searches, for a row's robots, the grid's cells within the largest of `reach_sq`."""
     grid = tile.grid
+    clear_lists(reach_sq, tile.distances, tile.neighbours, at, p.capacity)
     robot = load(tile.order, row)
     x, y, _, _ = gather_4(tile.body, robot)
     own = tile.order[row, 0]
@@ -198,20 +271,11 @@ def _search_cells(row, reach_sq, num_slots, tile, p):
         if low <= band <= high:
             first = grid.starts[band * grid.shape[0] + left]
             last = grid.starts[band * grid.shape[0] + right + 1]
-            filled = search(first, last, robot, splat(True), x, y, tile, row * p.capacity, filled, False, p)
+            filled = search(first, last, robot, splat(True), x, y, tile, at, filled, p)
 
 
 @inlined
-def _search(row, reach_sq, size, num_slots, tile, p):
-    clear_lists(reach_sq, tile.distances, tile.neighbours, row * p.capacity, p.capacity)
-    if p.grid:
-        _search_cells(row, reach_sq, num_slots, tile, p)
-    else:
-        _search_worlds(row, size, num_slots, tile, p)
-
-
-@inlined
-def find_neighbours(row, size, num_slots, tile, p):
+def find_neighbours(row, at, size, num_slots, tile, p):
     """Finds the neighbours of a row's robots.
 
     The search begins within each robot's `reach_sq`; a robot that finds fewer than it may have there is searched
@@ -224,11 +288,13 @@ def find_neighbours(row, size, num_slots, tile, p):
       tile: Tile with body, seen_x, seen_y, seen_slot, reach_sq; neighbours, counts and reach_sq are written.
       p: NeighbourParams.
     """
-    robot = load(tile.order, row)
-    at = row * p.capacity
-    reach_sq = gather(tile.reach_sq, robot)
-    _search(row, reach_sq, size, num_slots, tile, p)
-    if any_lane((load(tile.neighbours, at + p.capacity - 1) < 0) & (reach_sq < p.range_sq)):
-        _search(row, splat(p.range_sq), size, num_slots, tile, p)
-    remember_reach(robot, at, tile.distances, tile.neighbours, tile.reach_sq, p)
+    if p.grid:
+        robot = load(tile.order, row)
+        reach_sq = gather(tile.reach_sq, robot)
+        _search_cells(row, at, reach_sq, num_slots, tile, p)
+        if any_lane((load(tile.neighbours, at + p.capacity - 1) < 0) & (reach_sq < p.range_sq)):
+            _search_cells(row, at, splat(p.range_sq), num_slots, tile, p)
+        remember_reach(robot, at, tile.distances, tile.neighbours, tile.reach_sq, p)
+    else:
+        _search_worlds(row, at, size, num_slots, tile, p)
     tile.counts[row] = longest(tile.neighbours, at, p.capacity)

@@ -116,10 +116,10 @@ def _separation_gain(row, first_world, apart, tile, rng, p):
 
 
 @inlined
-def find_flock_terms(first_world, rows, tile, rng, p):
+def find_flock_terms(first_world, base, rows, tile, rng, p):
     """All passes before the preferred velocities."""
     for row in range(rows):
-        apart = look(row, tile, p.flock)
+        apart = look(row, (base + row) * p.near.capacity, tile, p.flock)
         finish_separation(row, tile, apart, _separation_gain(row, first_world, apart, tile, rng, p), p.flock)
         clear_leaders(row, tile)
     for row in range(rows):
@@ -129,17 +129,17 @@ def find_flock_terms(first_world, rows, tile, rng, p):
 
 
 @inlined
-def tile_velocities(first_world, num_slots, rows, tile, rng, p):
+def tile_velocities(first_world, base, num_slots, rows, tile, rng, p):
     """FL-ORCA's new velocities of all robots of a tile, into `tile.new_vx`, `tile.new_vy`."""
     size = p.robots * p.groups
     for row in range(rows):
-        find_neighbours(row, size, num_slots, tile, p.near)
+        find_neighbours(row, (base + row) * p.near.capacity, size, num_slots, tile, p.near)
     if p.flock.rules != NO_FLOCK:
-        find_flock_terms(first_world, rows, tile, rng, p)
+        find_flock_terms(first_world, base, rows, tile, rng, p)
     for row in range(rows):
         robot, count = load(tile.order, row), tile.counts[row]
         pref_x, pref_y = preferred_velocity(row, tile, p.flock)
-        build_half_planes(robot, tile.body, tile.neighbours, row * p.near.capacity, count, tile.lines, p.orca)
+        build_half_planes(robot, tile.body, tile.neighbours, (base + row) * p.near.capacity, count, tile.lines, p.orca)
         x, y = orca_velocity(tile.lines, count, pref_x, pref_y, tile.projected, p.orca)
         scatter(tile.new_vx, robot, x)
         scatter(tile.new_vy, robot, y)
@@ -164,7 +164,7 @@ def _move_world(world, base, state, tile, command_x, command_y, piloted, p):
 
 
 @kernel
-def advance(state, tile, command_x, command_y, piloted, p):
+def advance(state, tile, command_x, command_y, piloted, params):
     """Moves every world by one step.
 
     Args:
@@ -172,13 +172,15 @@ def advance(state, tile, command_x, command_y, piloted, p):
       tile: Tile.
       command_x, command_y: `[num_worlds]`, the learning robot's velocity, m/s.
       piloted: whether the learning robot obeys the command; else FL-ORCA drives it too.
-      p: SwarmParams.
+      params: SwarmParams, packed.
     """
+    p = params[0]
     num_worlds, size = state.pos_x.shape
     for first in range(0, num_worlds, p.tile_worlds):
         worlds = min(p.tile_worlds, num_worlds - first)
         rows = _load_tile(first, worlds, state, tile, p)
-        tile_velocities(first, worlds * size, rows, tile, state.rng, p)
+        base = 0 if p.near.grid else first // p.tile_worlds * tile.order.shape[0]
+        tile_velocities(first, base, worlds * size, rows, tile, state.rng, p)
         for i in range(worlds):
             _move_world(first + i, i * size, state, tile, command_x, command_y, piloted, p)
 

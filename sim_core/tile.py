@@ -64,7 +64,7 @@ class Tile(NamedTuple):
     grid: Grid
 
 
-GRID_FROM_ROBOTS = 150
+GRID_FROM_ROBOTS = 300
 """Worlds with at least as many robots are searched by grid; smaller ones robot by robot, which is faster there."""
 
 
@@ -78,11 +78,12 @@ def world_tile(config: WorldConfig, num_worlds: int, dtype: Any) -> Tile:
     size = config.num_robots
     if size >= GRID_FROM_ROBOTS:  # a row may be cut after any robot
         return empty_tile(size, size, config.max_neighbours, dtype)
-    rows = -(-min(worlds_per_tile(size), num_worlds) * size // LANES)
-    return empty_tile(rows * LANES, rows, config.max_neighbours, dtype)
+    worlds = min(worlds_per_tile(size), num_worlds)
+    rows = -(-worlds * size // LANES)
+    return empty_tile(rows * LANES, rows, config.max_neighbours, dtype, -(-num_worlds // worlds))
 
 
-def empty_tile(num_slots: int, num_rows: int, max_neighbours: int, dtype: Any) -> Tile:
+def empty_tile(num_slots: int, num_rows: int, max_neighbours: int, dtype: Any, num_tiles: int = 1) -> Tile:
     """Work space for `num_slots` robots in `num_rows` rows."""
     slots, k = num_slots + 1, max_neighbours
 
@@ -98,7 +99,7 @@ def empty_tile(num_slots: int, num_rows: int, max_neighbours: int, dtype: Any) -
         seen_y=np.zeros(slots, dtype),
         seen_slot=np.arange(slots, dtype=np.int32),
         order=np.arange(num_rows * LANES, dtype=np.int32).reshape(num_rows, LANES),
-        neighbours=whole(num_rows, k, LANES),
+        neighbours=np.full((num_tiles * num_rows, k, LANES), -1, np.int32),
         mates=whole(num_rows, k, LANES),
         counts=whole(num_rows),
         distances=np.zeros((k, LANES), dtype),

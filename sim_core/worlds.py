@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sim_core.config import WorldConfig
 from sim_core.methods import make_method
 from sim_core.outcomes import Outcome
+from sim_core.packed import packed
 from sim_core.rng import world_streams
 from sim_core.scenario import scenario_params
 from sim_core.state import WorldState, empty_state
@@ -45,7 +46,7 @@ class WorldBatch:
         self.method = make_method(config)
         self.state: WorldState = empty_state(config, num_worlds, np.float32)
         self._tile = world_tile(config, num_worlds, np.float32)
-        self._swarm = swarm_params(config, np.float32)
+        self._swarm = packed(swarm_params(config, np.float32))
         self._scenario = scenario_params(config)
         self._command_x = np.zeros(num_worlds, np.float32)
         self._command_y = np.zeros(num_worlds, np.float32)

@@ -17,6 +17,7 @@ from sim_core.config import WorldConfig
 from sim_core.jit import kernel
 from sim_core.methods.base import Method
 from sim_core.outcomes import Outcome, end_of_step
+from sim_core.packed import packed
 from sim_core.state import WorldState
 
 COUNT_LIMIT = 127
@@ -61,7 +62,8 @@ def sector_of(dx, dy, sectors):
 
 
 @kernel
-def _perceive(state, mask, out, p):
+def _perceive(state, mask, out, params):
+    p = params[0]
     for world in range(mask.shape[0]):
         if not mask[world]:
             continue
@@ -79,7 +81,8 @@ def _perceive(state, mask, out, p):
 
 
 @kernel
-def _outcome(state, out, p):
+def _outcome(state, out, params):
+    p = params[0]
     for world in range(out.shape[0]):
         ended = end_of_step(
             state.learner[world],
@@ -97,7 +100,8 @@ def _outcome(state, out, p):
 
 
 @kernel
-def _reward(state, outcome, out, p):
+def _reward(state, outcome, out, params):
+    p = params[0]
     for world in range(out.shape[0]):
         learner = state.learner[world]
         group = learner // p.robots
@@ -135,16 +139,18 @@ class SensorMethod(Method):
         self.observation_shape = (2 * config.sectors,)
         self._velocities = heading_velocities(config, np.float32)
         real = np.float32
-        self._params = SensorParams(
-            robots=config.robots,
-            sectors=config.sectors,
-            inner_sq=real(config.inner_radius_m) ** 2,
-            outer_sq=real(config.outer_radius_m) ** 2,
-            outer_m=real(config.outer_radius_m),
-            collision_sq=real(2 * config.robot_radius_m) ** 2,
-            horizon_steps=config.horizon_steps,
-            reward_scale=float(config.reward_scale),
-            clock_is_step=config.reward_clock == "step",
+        self._params = packed(
+            SensorParams(
+                robots=config.robots,
+                sectors=config.sectors,
+                inner_sq=real(config.inner_radius_m) ** 2,
+                outer_sq=real(config.outer_radius_m) ** 2,
+                outer_m=real(config.outer_radius_m),
+                collision_sq=real(2 * config.robot_radius_m) ** 2,
+                horizon_steps=config.horizon_steps,
+                reward_scale=float(config.reward_scale),
+                clock_is_step=config.reward_clock == "step",
+            )
         )
 
     def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sim_core.flocking import finish_separation, look, preferred_velocity, weighted_sum
+from sim_core.grid import CELLS_PER_RANGE, arrange
 from sim_core.jit import kernel
-from sim_core.lanes import LANES, load, scatter, splat, store
+from sim_core.lanes import LANES, gather, load, scatter, splat, store
 from sim_core.neighbours import find_neighbours, neighbour_params
 from sim_core.orca import build_half_planes, linear_program_2, linear_program_3, orca_params, orca_velocity
 from sim_core.step import find_flock_terms
@@ -28,27 +29,48 @@ class OrcaStep(NamedTuple):
 @kernel
 def _orca_rows(num_slots, rows, tile, pref_x, pref_y, planes, near, orca):
     for row in range(rows):
-        find_neighbours(row, num_slots, num_slots, tile, near)
+        find_neighbours(row, row * near.capacity, num_slots, num_slots, tile, near)
     for row in range(rows):
         robot, count = load(tile.order, row), tile.counts[row]
+        wish_x, wish_y = gather(pref_x, robot), gather(pref_y, robot)
         build_half_planes(robot, tile.body, tile.neighbours, row * near.capacity, count, tile.lines, orca)
-        x, y = orca_velocity(tile.lines, count, load(pref_x, row), load(pref_y, row), tile.projected, orca)
+        x, y = orca_velocity(tile.lines, count, wish_x, wish_y, tile.projected, orca)
         scatter(tile.new_vx, robot, x)
         scatter(tile.new_vy, robot, y)
         for i in range(4 * count):
             store(planes, 4 * near.capacity * row + i, load(tile.lines, i))
 
 
-def _world_tile(pos, vel, max_neighbours, reach_m, hidden, real):
-    """(tile, rows) of one world's robots."""
+@kernel
+def _arrange(num_slots, tile, edge_m):
+    return arrange(num_slots, tile, edge_m)
+
+
+def arranged(pos, edge_m, real=np.float32):
+    """(tile, rows) of one world's robots, sorted into a grid of cells of `edge_m` or longer.
+
+    Whatever `arrange` has to write holds nonsense before.
+    """
+    n = len(pos)
+    tile = empty_tile(n, n, 1, real)
+    tile.body[:n, :2] = pos
+    for array in (tile.order, tile.seen_slot, *tile.grid):
+        array[:] = -99
+    return tile, _arrange(n, tile, float(edge_m))
+
+
+def _world_tile(pos, vel, max_neighbours, reach_m, hidden, real, edge_m=None):
+    """(tile, rows) of one world's robots; searched by grid if `edge_m`, the edge of its cells, is given."""
     n = len(pos)
     rows = -(-n // LANES)
-    tile = empty_tile(rows * LANES, rows, max_neighbours, real)
+    tile = empty_tile(*((rows * LANES, rows) if edge_m is None else (n, n)), max_neighbours, real)
     tile.body[:n, :2], tile.body[:n, 2:] = pos, vel
     tile.seen_x[:n], tile.seen_y[:n] = np.transpose(pos)
     tile.reach_sq[:] = real(reach_m) ** 2
+    if edge_m is not None:
+        rows = _arrange(n, tile, edge_m)
     if hidden >= 0:
-        tile.seen_x[hidden] = np.nan
+        tile.seen_x[hidden if edge_m is None else tile.grid.place[hidden]] = np.nan
     return tile, rows
 
 
@@ -66,6 +88,7 @@ def orca_step(
     max_neighbours=10,
     hidden=-1,
     reach_m=None,
+    grid=False,
 ):
     """ORCA's step of one world's robots, computed in `real`.
 
@@ -74,18 +97,21 @@ def orca_step(
       real: np.float32 or np.float64.
       hidden: a robot that nobody perceives, or -1.
       reach_m: where the search for neighbours begins, the whole range by default.
+      grid: whether neighbours are searched by grid, as in large worlds.
     """
     pos, vel, pref = (np.asarray(array, real) for array in (pos, vel, pref))
     n = len(pos)
-    tile, rows = _world_tile(pos, vel, max_neighbours, range_m if reach_m is None else reach_m, hidden, real)
-    padded = np.zeros((2, rows * LANES), real)
+    edge_m = range_m / CELLS_PER_RANGE if grid else None
+    tile, rows = _world_tile(pos, vel, max_neighbours, range_m if reach_m is None else reach_m, hidden, real, edge_m)
+    padded = np.zeros((2, len(tile.body)), real)
     padded[:, :n] = pref.T
     planes = np.zeros((rows, max_neighbours, 4, LANES), real)
-    near = neighbour_params(max_neighbours, range_m, 0.1, real)
+    near = neighbour_params(max_neighbours, range_m, 0.1, real, grid=grid)
     orca = orca_params(radius_m, horizon_s, time_step_s, max_speed_m_s, real)
     _orca_rows(n, rows, tile, *padded, planes, near, orca)
-    neighbours = tile.neighbours.transpose(0, 2, 1).reshape(-1, max_neighbours)[:n]
-    lines = planes.transpose(0, 3, 1, 2).reshape(-1, max_neighbours, 4)[:n]
+    lane_of = np.argsort(tile.order[:rows].ravel(), kind="stable")[:n]  # the robots, then nobody
+    neighbours = tile.neighbours[:rows].transpose(0, 2, 1).reshape(-1, max_neighbours)[lane_of]
+    lines = planes.transpose(0, 3, 1, 2).reshape(-1, max_neighbours, 4)[lane_of]
     assert not lines[neighbours < 0].any()
     counts = (neighbours >= 0).sum(1)
     return OrcaStep(
@@ -154,8 +180,8 @@ class Flock(NamedTuple):
 @kernel
 def _flock_rows(num_slots, rows, tile, rng, pref_x, pref_y, p):
     for row in range(rows):
-        find_neighbours(row, num_slots, num_slots, tile, p.near)
-    find_flock_terms(0, rows, tile, rng, p)
+        find_neighbours(row, row * p.near.capacity, num_slots, num_slots, tile, p.near)
+    find_flock_terms(0, 0, rows, tile, rng, p)
     for row in range(rows):
         x, y = preferred_velocity(row, tile, p.flock)
         store(pref_x, row, x)
@@ -178,7 +204,7 @@ def flock_of(pos, vel, goals, seed, p, real=np.float32):
 
 @kernel
 def _terms(tile, gain, f):
-    apart = look(0, tile, f)
+    apart = look(0, 0, tile, f)
     finish_separation(0, tile, apart, splat(gain), f)
 
 
