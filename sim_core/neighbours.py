@@ -37,7 +37,6 @@ class NeighbourParams(NamedTuple):
 
     capacity: int
     grid: bool
-    remembers: bool
     range_sq: Any
     below_range_sq: Any
     drift_m: Any
@@ -53,13 +52,18 @@ def neighbour_params(
     return NeighbourParams(
         capacity,
         grid,
-        not grid,
         real(range_m) ** 2,
         np.nextafter(real(range_m) ** 2, real(0)),
         real(drift_m),
         real(-1),
         real(np.inf),
     )
+
+
+@inlined
+def lists_of(row, tile_index, tile, p):
+    """Vector of `tile.neighbours` where a row's lists begin; tiles that are searched by grid share one place."""
+    return ((0 if p.grid else tile_index) * tile.order.shape[0] + row) * p.capacity
 
 
 @inlined
@@ -121,7 +125,7 @@ def search(first, last, robot, inside, x, y, tile, at, filled, p):
         if any_lane(near):
             slot = splat(tile.seen_slot[candidate])
             near = near & (robot != slot)
-            if p.remembers:
+            if not p.grid:
                 for k in range(filled):
                     near = near & (load(tile.neighbours, at + k) != slot)
                 if not any_lane(near):
@@ -134,16 +138,17 @@ def search(first, last, robot, inside, x, y, tile, at, filled, p):
 
 
 @inlined
-def remember_reach(robot, at, distances, neighbours, reach_sq, p):
+def _remember_reach(hint, at, tile, p):
     """Notes for each robot how far the next step's search has to look, if nobody moves faster than expected.
 
     A full list's farthest neighbour is at most `drift_m` farther away a step later, and so are those before
-    it: a search within that distance fills the list again. It is a guess, never trusted: see `find_neighbours`.
+    it: a search within that distance fills the list again.
     """
     last = p.capacity - 1
-    reach_m = root(load(distances, last)) + p.drift_m
-    full = load(neighbours, at + last) >= 0
-    scatter(reach_sq, robot, select(full, minimum(reach_m * reach_m, splat(p.range_sq)), splat(p.range_sq)))
+    reach_m = root(load(tile.distances, last)) + p.drift_m
+    full = load(tile.neighbours, at + last) >= 0
+    reach_sq = select(full, minimum(reach_m * reach_m, splat(p.range_sq)), splat(p.range_sq))
+    scatter(tile.reach_sq, hint, reach_sq)
 
 
 @inlined
@@ -275,26 +280,30 @@ def _search_cells(row, at, reach_sq, num_slots, tile, p):
 
 
 @inlined
-def find_neighbours(row, at, size, num_slots, tile, p):
+def find_neighbours(row, tile_index, size, num_slots, tile, p):
     """Finds the neighbours of a row's robots.
 
-    The search begins within each robot's `reach_sq`; a robot that finds fewer than it may have there is searched
-    for again in the whole range, so that the result never depends on the guess.
+    What is known from the step before speeds the search up and never changes its result. In small worlds these are the
+    lists themselves: once up to date, they are right if no other robot lies within their farthest entry. By grid
+    it is a radius to begin within; a robot that finds fewer than it may have there is searched for in the whole range.
 
     Args:
       row: the row.
+      tile_index: which tile of the batch this is.
       size: robots in a world.
       num_slots: robots in the tile.
-      tile: Tile with body, seen_x, seen_y, seen_slot, reach_sq; neighbours, counts and reach_sq are written.
+      tile: Tile with body, seen_x, seen_y, seen_slot and what it remembers; neighbours and counts are written.
       p: NeighbourParams.
     """
+    at = lists_of(row, tile_index, tile, p)
     if p.grid:
         robot = load(tile.order, row)
-        reach_sq = gather(tile.reach_sq, robot)
+        hint = robot + tile_index * tile.reach_sq.shape[1]
+        reach_sq = gather(tile.reach_sq, hint)
         _search_cells(row, at, reach_sq, num_slots, tile, p)
         if any_lane((load(tile.neighbours, at + p.capacity - 1) < 0) & (reach_sq < p.range_sq)):
             _search_cells(row, at, splat(p.range_sq), num_slots, tile, p)
-        remember_reach(robot, at, tile.distances, tile.neighbours, tile.reach_sq, p)
+        _remember_reach(hint, at, tile, p)
     else:
         _search_worlds(row, at, size, num_slots, tile, p)
     tile.counts[row] = longest(tile.neighbours, at, p.capacity)

@@ -30,7 +30,6 @@ class WorldState(NamedTuple):
     episode_return: Any
     rng: Any
     machine: Any
-    reach_sq: Any
 
 
 def empty_state(config: WorldConfig, num_worlds: int, dtype: Any) -> WorldState:
@@ -49,5 +48,4 @@ def empty_state(config: WorldConfig, num_worlds: int, dtype: Any) -> WorldState:
         episode_return=np.zeros(num_worlds, np.float64),
         rng=np.zeros(num_worlds, np.uint64),
         machine=np.zeros(robots, np.int8),
-        reach_sq=np.full(robots, config.neighbour_range_m, dtype) ** 2,
     )

@@ -23,7 +23,7 @@ from sim_core.flocking import clear_leaders, finish_separation, look, mark_follo
 from sim_core.grid import CELLS_PER_RANGE, arrange
 from sim_core.jit import inlined, kernel
 from sim_core.lanes import LANES, any_lane, load, scatter, splat
-from sim_core.neighbours import NeighbourParams, find_neighbours, neighbour_params
+from sim_core.neighbours import NeighbourParams, find_neighbours, lists_of, neighbour_params
 from sim_core.orca import ORCAParams, build_half_planes, orca_params, orca_velocity
 from sim_core.rng import skip, uniform_after
 from sim_core.scenario import start_world
@@ -80,7 +80,6 @@ def _load_world(world, base, state, tile, p):
             tile.group[slot] = group
             if not p.near.grid:
                 tile.seen_x[slot], tile.seen_y[slot] = x, y
-            tile.reach_sq[slot] = state.reach_sq[world, i]
 
 
 @inlined
@@ -103,24 +102,24 @@ def _load_tile(first, worlds, state, tile, p):
 
 
 @inlined
-def _separation_gain(row, first_world, apart, tile, rng, p):
+def _separation_gain(row, tile_index, apart, tile, rng, p):
     """Gain of the published separation (a vector): 1 and a random part, one draw a robot."""
     if not (p.flock.rules == PUBLISHED and p.flock.separation_noise > p.flock.zero and any_lane(apart > p.flock.zero)):
         return splat(p.flock.one)
     size = p.robots * p.groups
     for lane in range(LANES):
         slot = tile.order[row, lane]
-        world = min(first_world + slot // size, rng.shape[0] - 1)
+        world = min(tile_index * p.tile_worlds + slot // size, rng.shape[0] - 1)
         tile.noise[lane] = uniform_after(rng[world], slot % size + 1)
     return p.flock.one + p.flock.separation_noise * load(tile.noise, 0)
 
 
 @inlined
-def find_flock_terms(first_world, base, rows, tile, rng, p):
+def find_flock_terms(tile_index, rows, tile, rng, p):
     """All passes before the preferred velocities."""
     for row in range(rows):
-        apart = look(row, (base + row) * p.near.capacity, tile, p.flock)
-        finish_separation(row, tile, apart, _separation_gain(row, first_world, apart, tile, rng, p), p.flock)
+        apart = look(row, lists_of(row, tile_index, tile, p.near), tile, p.flock)
+        finish_separation(row, tile, apart, _separation_gain(row, tile_index, apart, tile, rng, p), p.flock)
         clear_leaders(row, tile)
     for row in range(rows):
         mark_followers(row, FREE, FOLLOWS_FREE, tile)
@@ -129,17 +128,17 @@ def find_flock_terms(first_world, base, rows, tile, rng, p):
 
 
 @inlined
-def tile_velocities(first_world, base, num_slots, rows, tile, rng, p):
+def tile_velocities(tile_index, num_slots, rows, tile, rng, p):
     """FL-ORCA's new velocities of all robots of a tile, into `tile.new_vx`, `tile.new_vy`."""
     size = p.robots * p.groups
     for row in range(rows):
-        find_neighbours(row, (base + row) * p.near.capacity, size, num_slots, tile, p.near)
+        find_neighbours(row, tile_index, size, num_slots, tile, p.near)
     if p.flock.rules != NO_FLOCK:
-        find_flock_terms(first_world, base, rows, tile, rng, p)
+        find_flock_terms(tile_index, rows, tile, rng, p)
     for row in range(rows):
-        robot, count = load(tile.order, row), tile.counts[row]
+        robot, count, at = load(tile.order, row), tile.counts[row], lists_of(row, tile_index, tile, p.near)
         pref_x, pref_y = preferred_velocity(row, tile, p.flock)
-        build_half_planes(robot, tile.body, tile.neighbours, (base + row) * p.near.capacity, count, tile.lines, p.orca)
+        build_half_planes(robot, tile.body, tile.neighbours, at, count, tile.lines, p.orca)
         x, y = orca_velocity(tile.lines, count, pref_x, pref_y, tile.projected, p.orca)
         scatter(tile.new_vx, robot, x)
         scatter(tile.new_vy, robot, y)
@@ -157,7 +156,6 @@ def _move_world(world, base, state, tile, command_x, command_y, piloted, p):
         state.pos_x[world, i] += vx * p.time_step_s
         state.pos_y[world, i] += vy * p.time_step_s
         state.machine[world, i] = tile.machine[base + i]
-        state.reach_sq[world, i] = tile.reach_sq[base + i]
     state.steps[world] += 1
     if p.flock.rules == PUBLISHED and p.flock.separation_noise > p.flock.zero:
         skip(state.rng, world, state.pos_x.shape[1])
@@ -179,8 +177,7 @@ def advance(state, tile, command_x, command_y, piloted, params):
     for first in range(0, num_worlds, p.tile_worlds):
         worlds = min(p.tile_worlds, num_worlds - first)
         rows = _load_tile(first, worlds, state, tile, p)
-        base = 0 if p.near.grid else first // p.tile_worlds * tile.order.shape[0]
-        tile_velocities(first, base, worlds * size, rows, tile, state.rng, p)
+        tile_velocities(first // p.tile_worlds, worlds * size, rows, tile, state.rng, p)
         for i in range(worlds):
             _move_world(first + i, i * size, state, tile, command_x, command_y, piloted, p)
 

@@ -23,12 +23,12 @@ class Tile(NamedTuple):
     body: `[slots, 4]` position (metres) and velocity (m/s) in the old state.
     aim: `[slots, 4]` vector to the goal (metres), its squared length, 0.
     group: `[slots]` int32.
-    reach_sq: `[slots]`, radius within which the search for neighbours begins, squared.
+    reach_sq: `[tiles, slots]`, by grid: radius within which the search for neighbours begins, squared.
     seen_x, seen_y: `[slots]`, positions of candidates in search order; NaN where nobody may see it.
     seen_slot: `[slots]` int32, their slots.
     order: `[rows, 8]` int32, slots of the rows' lanes.
-    neighbours: `[rows, max_neighbours, 8]` int32 slots, nearest first, -1 for none.
-    mates: the same, with the robot itself in the place of one of another group or none.
+    neighbours: `[tiles, rows, max_neighbours, 8]` int32 slots, nearest first, -1 for none; by grid, one tile's.
+    mates: `[rows, max_neighbours, 8]`, the same, the robot itself in the place of one of another group or none.
     counts: `[rows]` int32, entries of the row's longest list.
     distances: `[max_neighbours, 8]`, squared metres.
     terms: `[rows, 6, 8]`, cohesion, separation and alignment.
@@ -77,14 +77,16 @@ def world_tile(config: WorldConfig, num_worlds: int, dtype: Any) -> Tile:
     """Work space for a batch of `num_worlds` worlds of `config`."""
     size = config.num_robots
     if size >= GRID_FROM_ROBOTS:  # a row may be cut after any robot
-        return empty_tile(size, size, config.max_neighbours, dtype)
+        return empty_tile(size, size, config.max_neighbours, dtype, num_tiles=num_worlds, grid=True)
     worlds = min(worlds_per_tile(size), num_worlds)
     rows = -(-worlds * size // LANES)
-    return empty_tile(rows * LANES, rows, config.max_neighbours, dtype, -(-num_worlds // worlds))
+    return empty_tile(rows * LANES, rows, config.max_neighbours, dtype, num_tiles=-(-num_worlds // worlds))
 
 
-def empty_tile(num_slots: int, num_rows: int, max_neighbours: int, dtype: Any, num_tiles: int = 1) -> Tile:
-    """Work space for `num_slots` robots in `num_rows` rows."""
+def empty_tile(
+    num_slots: int, num_rows: int, max_neighbours: int, dtype: Any, *, num_tiles: int = 1, grid: bool = False
+) -> Tile:
+    """Work space for `num_slots` robots in `num_rows` rows, and what it remembers of `num_tiles` tiles."""
     slots, k = num_slots + 1, max_neighbours
 
     def whole(*shape: int) -> Any:
@@ -94,12 +96,12 @@ def empty_tile(num_slots: int, num_rows: int, max_neighbours: int, dtype: Any, n
         body=np.full((slots, 4), np.nan, dtype),
         aim=np.full((slots, 4), np.nan, dtype),
         group=whole(slots),
-        reach_sq=np.zeros(slots, dtype),
+        reach_sq=np.zeros((num_tiles, slots), dtype),
         seen_x=np.zeros(slots, dtype),
         seen_y=np.zeros(slots, dtype),
         seen_slot=np.arange(slots, dtype=np.int32),
         order=np.arange(num_rows * LANES, dtype=np.int32).reshape(num_rows, LANES),
-        neighbours=np.full((num_tiles * num_rows, k, LANES), -1, np.int32),
+        neighbours=np.full((1 if grid else num_tiles, num_rows, k, LANES), -1, np.int32),
         mates=whole(num_rows, k, LANES),
         counts=whole(num_rows),
         distances=np.zeros((k, LANES), dtype),

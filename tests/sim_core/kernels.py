@@ -29,7 +29,7 @@ class OrcaStep(NamedTuple):
 @kernel
 def _orca_rows(num_slots, rows, tile, pref_x, pref_y, planes, near, orca):
     for row in range(rows):
-        find_neighbours(row, row * near.capacity, num_slots, num_slots, tile, near)
+        find_neighbours(row, 0, num_slots, num_slots, tile, near)
     for row in range(rows):
         robot, count = load(tile.order, row), tile.counts[row]
         wish_x, wish_y = gather(pref_x, robot), gather(pref_y, robot)
@@ -89,6 +89,7 @@ def orca_step(
     hidden=-1,
     reach_m=None,
     grid=False,
+    remembered=None,
 ):
     """ORCA's step of one world's robots, computed in `real`.
 
@@ -98,11 +99,16 @@ def orca_step(
       hidden: a robot that nobody perceives, or -1.
       reach_m: where the search for neighbours begins, the whole range by default.
       grid: whether neighbours are searched by grid, as in large worlds.
+      remembered: `[n, max_neighbours]`, the robots' lists of the step before, -1 for none; empty by default.
     """
     pos, vel, pref = (np.asarray(array, real) for array in (pos, vel, pref))
     n = len(pos)
     edge_m = range_m / CELLS_PER_RANGE if grid else None
     tile, rows = _world_tile(pos, vel, max_neighbours, range_m if reach_m is None else reach_m, hidden, real, edge_m)
+    if remembered is not None:
+        lists = np.full((rows * LANES, max_neighbours), -1)
+        lists[:n] = remembered
+        tile.neighbours[0] = lists.reshape(rows, LANES, max_neighbours).transpose(0, 2, 1)
     padded = np.zeros((2, len(tile.body)), real)
     padded[:, :n] = pref.T
     planes = np.zeros((rows, max_neighbours, 4, LANES), real)
@@ -110,7 +116,7 @@ def orca_step(
     orca = orca_params(radius_m, horizon_s, time_step_s, max_speed_m_s, real)
     _orca_rows(n, rows, tile, *padded, planes, near, orca)
     lane_of = np.argsort(tile.order[:rows].ravel(), kind="stable")[:n]  # the robots, then nobody
-    neighbours = tile.neighbours[:rows].transpose(0, 2, 1).reshape(-1, max_neighbours)[lane_of]
+    neighbours = tile.neighbours[0, :rows].transpose(0, 2, 1).reshape(-1, max_neighbours)[lane_of]
     lines = planes.transpose(0, 3, 1, 2).reshape(-1, max_neighbours, 4)[lane_of]
     assert not lines[neighbours < 0].any()
     counts = (neighbours >= 0).sum(1)
@@ -180,8 +186,8 @@ class Flock(NamedTuple):
 @kernel
 def _flock_rows(num_slots, rows, tile, rng, pref_x, pref_y, p):
     for row in range(rows):
-        find_neighbours(row, row * p.near.capacity, num_slots, num_slots, tile, p.near)
-    find_flock_terms(0, 0, rows, tile, rng, p)
+        find_neighbours(row, 0, num_slots, num_slots, tile, p.near)
+    find_flock_terms(0, rows, tile, rng, p)
     for row in range(rows):
         x, y = preferred_velocity(row, tile, p.flock)
         store(pref_x, row, x)
@@ -217,7 +223,7 @@ def terms_of_robot_0(pos, vel, goal, gain, f, robots, real=np.float32):
     tile.aim[0] = *goal, np.dot(goal, goal), 0
     tile.group[:n] = np.arange(n) // robots
     tile.neighbours[:] = -1
-    tile.neighbours[0, :, 0] = np.arange(1, n)
+    tile.neighbours[0, 0, :, 0] = np.arange(1, n)
     tile.counts[0] = n - 1
     _terms(tile, real(gain), f)
     return tile.terms[0, :, 0].reshape(3, 2)
