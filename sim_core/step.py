@@ -83,7 +83,7 @@ def _load_world(world, base, state, tile, p):
 
 
 @inlined
-def _load_tile(first, worlds, state, tile, p):
+def load_tile(first, worlds, state, tile, p):
     """Copies the old state of `worlds` worlds into the tile and arranges the candidates; returns the rows."""
     size = p.robots * p.groups
     for i in range(worlds):
@@ -145,7 +145,7 @@ def tile_velocities(tile_index, num_slots, rows, tile, rng, p):
 
 
 @inlined
-def _move_world(world, base, state, tile, command_x, command_y, piloted, p):
+def move_world(world, base, state, tile, command_x, command_y, piloted, p):
     """Moves one world's robots with the tile's new velocities."""
     if piloted:
         tile.new_vx[base + state.learner[world]] = command_x[world]
@@ -176,10 +176,10 @@ def advance(state, tile, command_x, command_y, piloted, params):
     num_worlds, size = state.pos_x.shape
     for first in range(0, num_worlds, p.tile_worlds):
         worlds = min(p.tile_worlds, num_worlds - first)
-        rows = _load_tile(first, worlds, state, tile, p)
+        rows = load_tile(first, worlds, state, tile, p)
         tile_velocities(first // p.tile_worlds, worlds * size, rows, tile, state.rng, p)
         for i in range(worlds):
-            _move_world(first + i, i * size, state, tile, command_x, command_y, piloted, p)
+            move_world(first + i, i * size, state, tile, command_x, command_y, piloted, p)
 
 
 @kernel

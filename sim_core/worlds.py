@@ -45,8 +45,8 @@ class WorldBatch:
         self.num_worlds = num_worlds
         self.method = make_method(config)
         self.state: WorldState = empty_state(config, num_worlds, np.float32)
-        self._tile = world_tile(config, num_worlds, np.float32)
-        self._swarm = packed(swarm_params(config, np.float32))
+        self.tile = world_tile(config, num_worlds, np.float32)
+        self.swarm = packed(swarm_params(config, np.float32))
         self._scenario = scenario_params(config)
         self._command_x = np.zeros(num_worlds, np.float32)
         self._command_y = np.zeros(num_worlds, np.float32)
@@ -93,7 +93,7 @@ class WorldBatch:
             self.swarm_step()
         else:
             self.method.velocity(self.state, action, self._command_x, self._command_y)
-            advance(self.state, self._tile, self._command_x, self._command_y, True, self._swarm)
+            advance(self.state, self.tile, self._command_x, self._command_y, True, self.swarm)
         self.method.outcome(self.state, self._outcome)
         self.method.reward(self.state, self._outcome, self._reward)
         self.method.perceive(self.state, self._all, self._observation)
@@ -107,7 +107,7 @@ class WorldBatch:
 
     def swarm_step(self) -> None:
         """Moves every world by one step, the learning robot too, and nothing else: no outcome, no observation."""
-        advance(self.state, self._tile, self._command_x, self._command_y, False, self._swarm)
+        advance(self.state, self.tile, self._command_x, self._command_y, False, self.swarm)
 
     def positions(self) -> NDArray[np.float32]:
         """Positions `[num_worlds, num_robots, 2]`, metres."""

@@ -1,7 +1,7 @@
 """How exact the simulator is, in numbers: `python -m tests.benchmarks.exactness`.
 
-Sections: `scenes`, one step of random scenes against RVO2 (pyrvo); `episodes`, steps of whole FL-ORCA episodes
-against RVO2; `float32`, the same kernels in float32 and float64; `swarm`, FL-ORCA alone over whole episodes.
+Sections: `scenes`, one step of random scenes against RVO2 (pyrvo); `episodes`, steps along whole episodes against
+RVO2; `float32`, the same kernels in float32 and float64; `swarm`, FL-ORCA alone over whole episodes.
 Exits with 1 when a bound of the first three is broken, or when in the last two robots overlap or one is too fast
 or not finite; arrivals and segregation are measured, not judged.
 """
@@ -117,16 +117,20 @@ def scenes_section(run: Run, options: argparse.Namespace) -> bool:
 
 
 def episodes_section(run: Run, options: argparse.Namespace) -> bool:
-    """Steps of whole episodes."""
-    title = f"every {EVERY_STEPS}th step of FL-ORCA episodes against RVO2"
-    table, parities, worlds = new_table(title, "setup", *PARITY_COLUMNS), [], 8
-    for robots, groups in EPISODE_SETUPS:
-        found = run(work.episode_parity, [(robots, groups, seeds, EVERY_STEPS) for seeds in parts(worlds, 4)])
-        parities.append(total(found))
-        scenes = worlds * -(-work.WHOLE_STEPS // EVERY_STEPS)
-        table.add_row(f"{robots}r×{groups}g", *parity_row(scenes, parities[-1]))
-    CONSOLE.print(table)
-    return matches_rvo2(total(parities))
+    """Steps of whole episodes, from FL-ORCA's states and of worlds without flocking."""
+    ok, worlds, scenes = True, 8, 8 * -(-work.WHOLE_STEPS // EVERY_STEPS)
+    for title, parity in (
+        (f"one step from every {EVERY_STEPS}th state of FL-ORCA episodes against RVO2", work.kernel_parity),
+        (f"every {EVERY_STEPS}th step of worlds without flocking against RVO2", work.world_parity),
+    ):
+        table, parities = new_table(title, "setup", *PARITY_COLUMNS), []
+        for robots, groups in EPISODE_SETUPS:
+            found = run(parity, [(robots, groups, seeds, EVERY_STEPS) for seeds in parts(worlds, 4)])
+            parities.append(total(found))
+            table.add_row(f"{robots}r×{groups}g", *parity_row(scenes, parities[-1]))
+        CONSOLE.print(table)
+        ok &= matches_rvo2(total(parities))
+    return ok
 
 
 def spread_row(errors: np.ndarray) -> list[str]:

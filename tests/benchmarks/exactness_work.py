@@ -1,6 +1,6 @@
 """The pieces of `exactness`, each small enough for one process: what is run and what is measured of it."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -10,7 +10,7 @@ from sim_core.segregation import mean_goal_distance_m, segregated_fraction
 from sim_core.worlds import WorldBatch
 from tests.sim_core.parity import Parity, compare, total
 from tests.sim_core.precision import drifts, one_step_difference
-from tests.sim_core.scenes import heading_scene, numbered_scene, world_scene
+from tests.sim_core.scenes import goal_scene, heading_scene, numbered_scene, world_scene
 
 WHOLE_STEPS = 500
 WATCHED_STEPS = tuple(range(50, WHOLE_STEPS + 1, 50))
@@ -22,21 +22,31 @@ def scene_parity(kind: str, numbers: range, settings: dict[str, float]) -> tuple
     return total(found), [number for number, one in zip(numbers, found, strict=True) if one.unexplained]
 
 
-def fresh_worlds(robots: int, groups: int, seeds: range) -> WorldBatch:
-    """Worlds of the default settings at the start of an episode, one a seed."""
-    worlds = WorldBatch(WorldConfig(robots=robots, groups=groups), len(seeds))
+def fresh_worlds(robots: int, groups: int, seeds: range, **settings: Any) -> WorldBatch:
+    """Worlds of the default settings but for `settings`, at the start of an episode, one a seed."""
+    worlds = WorldBatch(WorldConfig(robots=robots, groups=groups, **settings), len(seeds))
     worlds.seed(list(seeds))
     worlds.reset()
     return worlds
 
 
-def episode_parity(robots: int, groups: int, seeds: range, every: int) -> Parity:
-    """Parity at every `every`-th step of whole FL-ORCA episodes."""
+def kernel_parity(robots: int, groups: int, seeds: range, every: int) -> Parity:
+    """Parity of one step from every `every`-th state of whole FL-ORCA episodes."""
     worlds, rng, found = fresh_worlds(robots, groups, seeds), np.random.default_rng(seeds.start), []
     for step in range(WHOLE_STEPS):
         if step % every == 0:
             found += [compare(heading_scene(worlds, world, rng)) for world in range(len(seeds))]
         worlds.step(None)
+    return total(found)
+
+
+def world_parity(robots: int, groups: int, seeds: range, every: int) -> Parity:
+    """Parity of every `every`-th step itself of whole episodes without flocking."""
+    worlds, found = fresh_worlds(robots, groups, seeds, flocking="none"), []
+    for step in range(WHOLE_STEPS):
+        before = [goal_scene(worlds, world) for world in range(len(seeds))] if step % every == 0 else []
+        worlds.step(None)
+        found += [compare(scene, world_scene(worlds, world).vel) for world, scene in enumerate(before)]
     return total(found)
 
 

@@ -1,4 +1,4 @@
-"""The simulator's yardsticks, in sections: against pyrvo, against RVO2 in C++, by size, by cores, from the start.
+"""The simulator's yardsticks, in sections: against pyrvo, against RVO2 in C++, by pass, by size, by cores, from the start.
 
 All but the section on cores run on one core, with the child processes that they start.
 """
@@ -9,10 +9,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from tests.benchmarks import simulator_processes, simulator_rivals, simulator_scaling
+from tests.benchmarks import simulator_passes, simulator_processes, simulator_rivals, simulator_scaling
 from tests.benchmarks.timing import pinned
 
-SECTIONS = ("full", "orca", "scaling", "cores", "startup")
+SECTIONS = ("full", "orca", "passes", "scaling", "cores", "startup")
 
 
 def main(sections: Sequence[str] | None = None, rvo2: Sequence[Path] = ()) -> None:
@@ -21,6 +21,7 @@ def main(sections: Sequence[str] | None = None, rvo2: Sequence[Path] = ()) -> No
     tables = {
         "full": simulator_rivals.full_table,
         "orca": lambda: simulator_rivals.orca_table(rvo2),
+        "passes": simulator_passes.table,
         "scaling": simulator_scaling.table,
         "cores": lambda: simulator_processes.cores_table(cores),
         "startup": simulator_processes.startup_table,

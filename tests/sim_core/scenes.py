@@ -54,6 +54,15 @@ def heading_scene(worlds, world, rng):
     return Scene(pos, vel, (heading + rng.normal(0, 0.1, pos.shape)).astype(np.float32))
 
 
+def goal_scene(worlds, world):
+    """A world of a WorldBatch without flocking as ORCA's scene, in the order of operations of the worlds."""
+    pos, vel, goal = world_scene(worlds, world)
+    x, y = (goal - pos).T
+    length_sq = x * x + y * y
+    scale = np.where(length_sq > 1, 1 / np.sqrt(length_sq), np.float32(1))
+    return Scene(pos, vel, np.stack([x * scale, y * scale], axis=1))
+
+
 def _velocities(n, rng):
     """Random velocities no faster than the limit, and preferred ones that may be."""
     vel = rng.normal(0, 0.5, (n, 2))
@@ -124,6 +133,15 @@ def _turned_lattice(n, rng):
     return tuple(array @ turn for array in _lattice(n, rng))
 
 
+def _patches(n, rng):
+    """Heaps of one to twelve robots out of each other's range: robots with few neighbours beside some with many."""
+    patch = np.searchsorted(np.cumsum(rng.integers(1, 13, n)), np.arange(n), side="right")
+    centre = 4.0 * _grid(n)[patch]
+    pos = centre + rng.choice([0.1, 0.25, 0.5]) * rng.normal(0, 1, (n, 2))
+    order = rng.permutation(n)
+    return pos[order], *_velocities(n, rng)
+
+
 def _crossing(n, rng):
     """Two to eight groups on their way through one place."""
     groups = int(rng.integers(2, 9))
@@ -145,6 +163,7 @@ SCENES = {
     "lattice": _lattice,
     "turned lattice": _turned_lattice,
     "crossing": _crossing,
+    "patches": _patches,
 }
 KINDS = tuple(SCENES)
 GENERIC_KINDS = tuple(kind for kind in KINDS if kind not in ("same place", "lattice", "turned lattice"))

@@ -1,0 +1,265 @@
+"""Every operation on vectors against numpy, bit for bit, on ordinary and on special numbers."""
+
+import itertools
+
+import numpy as np
+import pytest
+from numba.core.errors import TypingError
+
+from sim_core.jit import kernel
+from sim_core.lanes import (
+    LANES,
+    any_lane,
+    gather,
+    gather_4,
+    lane,
+    load,
+    maximum,
+    minimum,
+    root,
+    scatter,
+    select,
+    splat,
+    store,
+)
+
+REALS = (np.float32, np.float64)
+TYPES = (*REALS, np.int32)
+MASKS = 256  # all masks of eight lanes
+
+
+def special_numbers(dtype):
+    """Ordinary, extreme and odd numbers of a type."""
+    drawn = np.random.default_rng(0).normal(0, 3, 9)
+    if dtype == np.int32:
+        return np.array([0, 1, -1, 2, 7, -13, 2**31 - 1, -(2**31), *(1000 * drawn)]).astype(dtype)
+    limits = np.finfo(dtype)
+    odd = [0.0, -0.0, np.inf, -np.inf, np.nan, 1.0, -1.0, limits.max, -limits.max, limits.tiny, limits.eps]
+    return np.array([*odd, limits.smallest_subnormal, -limits.smallest_subnormal, 3.0, -2.5, *drawn], dtype)
+
+
+def pairs(dtype):
+    """All pairs of special numbers, some twice so that vectors are full: two arrays of equal size."""
+    found = np.array(list(itertools.product(special_numbers(dtype), repeat=2)), dtype).T
+    return np.ascontiguousarray(np.resize(found, (2, -(-found.shape[1] // LANES) * LANES)))
+
+
+def assert_same_bits(found, expected, message=""):
+    """Equal in every bit, except that any NaN is as good as another."""
+    found, expected = np.asarray(found), np.asarray(expected)
+    assert (found.dtype, found.shape) == (expected.dtype, expected.shape), message
+    if found.dtype.kind == "f":
+        assert np.array_equal(np.signbit(found) & ~np.isnan(found), np.signbit(expected) & ~np.isnan(expected)), message
+    np.testing.assert_array_equal(found, expected, err_msg=message)
+
+
+def assert_all_same(found, expected):
+    """Row by row, the results of a kernel and what numpy says, by name."""
+    for row, (name, values) in zip(found, expected.items(), strict=True):
+        assert_same_bits(row, values, name)
+
+
+@kernel
+def _arithmetic(a, b, scalar, out, masks):
+    vectors = a.shape[0] // LANES
+    for i in range(vectors):
+        x, y = load(a, i), load(b, i)
+        results = (
+            x + y, x - y, x * y, x * y + x, x + scalar, scalar + x, x - scalar, scalar - x, x * scalar, scalar * x,
+            x + 2, 2 - x, select(x < y, x, y), select(x < y, scalar, y), select(x < y, x, scalar), splat(scalar),
+        )  # fmt: skip
+        for k in range(len(results)):
+            store(out, k * vectors + i, results[k])
+        compared = (
+            x < y, x <= y, x > y, x >= y, x == y, x != y,
+            x < scalar, scalar < x, x >= scalar, scalar >= x, x == scalar, scalar != x,
+        )  # fmt: skip
+        for k in range(len(compared)):
+            store(masks, k * vectors + i, select(compared[k], splat(1), splat(0)))
+
+
+def arithmetic_of_numpy(x, y, s):
+    """(results, comparisons) by name, in the order of `_arithmetic`."""
+    two, every = x.dtype.type(2), np.full_like(x, s)
+    differ = (x < y) | (x > y)  # NaN differs from nothing
+    results = {
+        "x + y": x + y, "x - y": x - y, "x * y": x * y, "x * y + x": x * y + x, "x + s": x + s, "s + x": s + x,
+        "x - s": x - s, "s - x": s - x, "x * s": x * s, "s * x": s * x, "x + 2": x + two, "2 - x": two - x,
+        "select": np.where(x < y, x, y), "select s else y": np.where(x < y, every, y),
+        "select x else s": np.where(x < y, x, every), "splat": every,
+    }  # fmt: skip
+    compared = {
+        "x < y": x < y, "x <= y": x <= y, "x > y": x > y, "x >= y": x >= y, "x == y": x == y, "x != y": differ,
+        "x < s": x < s, "s < x": s < x, "x >= s": x >= s, "s >= x": s >= x, "x == s": x == s,
+        "s != x": (x < s) | (x > s),
+    }  # fmt: skip
+    return results, compared
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+def test_arithmetic_comparison_and_choice(dtype):
+    a, b = pairs(dtype)
+    for scalar in special_numbers(dtype):
+        with np.errstate(all="ignore"):
+            results, compared = arithmetic_of_numpy(a, b, scalar)
+        out, masks = np.full((len(results), len(a)), 77, dtype), np.full((len(compared), len(a)), 77, np.int32)
+        _arithmetic(a, b, scalar, out, masks)
+        assert_all_same(out, results)
+        assert_all_same(masks != 0, compared)
+
+
+@kernel
+def _of_reals(a, b, scalar, out):
+    vectors = a.shape[0] // LANES
+    for i in range(vectors):
+        x, y = load(a, i), load(b, i)
+        results = (
+            x / y, x / scalar, scalar / x, root(x), -x, abs(x), minimum(x, y), maximum(x, y), x / 3, 0.1 * x,
+        )  # fmt: skip
+        for k in range(len(results)):
+            store(out, k * vectors + i, results[k])
+
+
+@pytest.mark.parametrize("dtype", REALS)
+def test_arithmetic_of_real_numbers_alone(dtype):
+    a, b = pairs(dtype)
+    for scalar in special_numbers(dtype):
+        with np.errstate(all="ignore"):
+            expected = {
+                "x / y": a / b, "x / s": a / scalar, "s / x": scalar / a, "root": np.sqrt(a), "-x": -a,
+                "abs": np.abs(a),
+                "minimum": np.where(a < b, a, b), "maximum": np.where(a > b, a, b), "x / 3": a / dtype(3),
+                "0.1 * x": dtype(0.1) * a,
+            }  # fmt: skip
+        out = np.full((len(expected), len(a)), 77, dtype)
+        _of_reals(a, b, scalar, out)
+        assert_all_same(out, expected)
+
+
+@kernel
+def _of_whole_numbers(a, b, scalar, out):
+    vectors = a.shape[0] // LANES
+    for i in range(vectors):
+        x, y = load(a, i), load(b, i)
+        results = (x & y, x | y, ~x, x & scalar, scalar & x, x | scalar, scalar | x, x & 6, x | 1, splat(-7))
+        for k in range(len(results)):
+            store(out, k * vectors + i, results[k])
+
+
+def test_bits_of_whole_numbers():
+    a, b = pairs(np.int32)
+    for s in special_numbers(np.int32):
+        expected = {
+            "x & y": a & b, "x | y": a | b, "~x": ~a, "x & s": a & s, "s & x": a & s, "x | s": a | s, "s | x": a | s,
+            "x & 6": a & 6, "x | 1": a | 1, "splat": np.full_like(a, -7),
+        }  # fmt: skip
+        out = np.full((len(expected), len(a)), 77, np.int32)
+        _of_whole_numbers(a, b, s, out)
+        assert_all_same(out, expected)
+
+
+@kernel
+def _masks(a, b, flag, out, some):
+    one, zero = splat(1), splat(0)
+    vectors = a.shape[0] // LANES
+    for i in range(vectors):
+        p, q = load(a, i) != 0, load(b, i) != 0
+        results = (p & q, p | q, ~p, p == q, p != q, p & ~q | (q & ~p), splat(True), splat(False), splat(flag))
+        for k in range(len(results)):
+            store(out, k * vectors + i, select(results[k], one, zero))
+        some[i] = any_lane(p)
+
+
+def test_masks():
+    lanes = np.arange(MASKS)[:, None] >> np.arange(LANES) & 1
+    a = np.resize(lanes, (3, MASKS, LANES)).astype(np.int32)
+    b = np.stack([lanes, lanes[::-1], np.roll(lanes, 85, axis=0)]).astype(np.int32)
+    p, q, no = a != 0, b != 0, np.zeros(a.shape, bool)
+    for flag in (True, False):
+        out, some = np.full((9, *a.shape), 77, np.int32), np.full(3 * MASKS, True)
+        _masks(a.ravel(), b.ravel(), flag, out, some)
+        expected = (p & q, p | q, ~p, p == q, p != q, p ^ q, ~no, no, no | flag)
+        np.testing.assert_array_equal(out, np.array(expected).astype(np.int32))
+        np.testing.assert_array_equal(some, np.tile(np.arange(MASKS) > 0, 3))  # the mask 0 is the empty one
+
+
+@kernel
+def _memory(source, table, indices, rows, out, columns, scattered, lanes):
+    last = indices.shape[0] // LANES - 1
+    for i in range(last, -1, -1):
+        index = load(indices, i)
+        found = gather(source, index)
+        store(out, i, found)
+        scatter(scattered, index, load(source, i))
+        four = gather_4(table, load(rows, i))
+        for k in range(4):
+            store(columns, 4 * i + k, four[k])
+        for k in range(LANES):
+            lanes[i, k] = lane(found, k)
+    return lane(load(source, 0), 2)
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+def test_reading_and_writing_memory(dtype):
+    rng = np.random.default_rng(1)
+    vectors, size = 20, 20 * LANES
+    source = rng.integers(-1000, 1000, (4, size // 4)).astype(dtype)  # seen flat
+    table = rng.integers(-1000, 1000, (5, 6, 4)).astype(dtype)
+    indices = rng.integers(0, size, (vectors, LANES)).astype(np.int32)
+    indices[3], indices[4], indices[5] = 7, np.arange(LANES)[::-1], [0, size - 1] * 4  # repeated, turned, at the ends
+    rows = rng.integers(0, 30, (vectors, LANES)).astype(np.int32)
+    rows[1], rows[2] = 29, [0, 29] * 4
+    out, lanes = np.zeros((2, vectors, LANES), dtype)
+    columns, scattered = np.zeros((vectors, 4, LANES), dtype), np.full(size, 77, dtype)
+    third = _memory(source, table, indices.ravel(), rows.ravel(), out, columns, scattered, lanes)
+    flat = source.ravel()
+    assert_same_bits(out, flat[indices])
+    assert_same_bits(lanes, flat[indices])
+    assert third == flat[2]
+    assert_same_bits(columns, table.reshape(30, 4)[rows].transpose(0, 2, 1))
+    expected = np.full(size, 77, dtype)
+    for i in range(vectors - 1, -1, -1):
+        for k in range(LANES):  # where an index is repeated, the last lane stays
+            expected[indices[i, k]] = flat[LANES * i + k]
+    assert_same_bits(scattered, expected)
+
+
+def _adds(a, b):
+    store(a, 0, load(a, 0) + load(b, 0))
+
+
+def _compares(a, b):
+    return any_lane(load(a, 0) < load(b, 0))
+
+
+def _adds_a_name(a, b):
+    store(a, 0, load(a, 0) + "1")
+
+
+def _adds_nothing(a, b):
+    store(a, 0, None + load(a, 0))
+
+
+def _adds_an_array(a, b):
+    store(a, 0, load(a, 0) + a)
+
+
+def _floor_divides(a, b):
+    store(a, 0, load(a, 0) // 2)
+
+
+def _asks_for_truth(a, b):
+    return 1 if load(a, 0) < 0 else 2
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.int32])
+@pytest.mark.parametrize("function", [_adds, _compares])
+def test_two_element_types_do_not_mix(function, dtype):
+    with pytest.raises(TypingError, match=r"Lanes\(float32\)"):
+        kernel(function)(np.zeros(LANES, np.float32), np.zeros(LANES, dtype))
+
+
+@pytest.mark.parametrize("function", [_adds_a_name, _adds_nothing, _adds_an_array, _floor_divides, _asks_for_truth])
+def test_what_a_vector_cannot_do_is_refused(function):
+    with pytest.raises(TypingError, match="Lanes"):
+        kernel(function)(np.zeros(LANES, np.float32), np.zeros(LANES, np.float32))
