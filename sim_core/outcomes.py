@@ -45,15 +45,13 @@ def collides(robot, pos_x, pos_y, distance_sq):
 @kernel
 def sensed(robot, robots, pos_x, pos_y, range_sq):
     """(own, others): robots of the own and of other groups within the sensing range."""
-    own, others = 0, 0
+    own, others = -1, 0  # the robot itself is not counted
+    group_begin = robot // robots * robots
     for other in range(pos_x.shape[0]):
         dx, dy = pos_x[other] - pos_x[robot], pos_y[other] - pos_y[robot]
-        if other == robot or dx * dx + dy * dy >= range_sq:
-            continue
-        if other // robots == robot // robots:
-            own += 1
-        else:
-            others += 1
+        if dx * dx + dy * dy < range_sq:
+            mate = group_begin <= other < group_begin + robots
+            own, others = own + mate, others + (not mate)
     return own, others
 
 

@@ -54,29 +54,42 @@ def heading_velocities(config: WorldConfig, dtype: Any) -> NDArray[Any]:
     return velocity.astype(dtype)
 
 
-@kernel
-def sector_of(dx, dy, sectors):
-    """Sector 0..sectors-1 of the direction (dx, dy); sector 0 begins at angle -pi."""
-    turn = (math.atan2(dy, dx) + math.pi) / (2.0 * math.pi)
-    return min(int(turn * sectors), sectors - 1)
+def sector_edges(sectors: int) -> NDArray[np.float64]:
+    """Unit vectors `[sectors, 2]` at the angles where the sectors begin, from -pi on."""
+    angle = np.arange(sectors) * (2 * math.pi / sectors) - math.pi
+    return np.round(np.stack([np.cos(angle), np.sin(angle)], axis=1), 15)  # so that 45 and 90 degrees are exact
 
 
 @kernel
-def _perceive(state, mask, out, params):
+def sector_of(dx, dy, edges):
+    """Sector 0..sectors-1 of the direction (dx, dy); sector 0 begins at angle -pi. `edges` as of `sector_edges`."""
+    sectors = edges.shape[0]
+    half = (sectors + 1) // 2  # the first edge at or above angle 0
+    first, last = (half, sectors) if dy >= 0.0 else (1, half)
+    sector = first - 1
+    for edge in range(first, last):  # no angle is needed to see on which side of an edge a direction lies
+        sector += 1 if edges[edge, 0] * dy - edges[edge, 1] * dx >= 0.0 else 0
+    return sector
+
+
+@kernel
+def _perceive(state, mask, out, edges, params):
     p = params[0]
     for world in range(mask.shape[0]):
         if not mask[world]:
             continue
         pos_x, pos_y = state.pos_x[world], state.pos_y[world]
         learner = state.learner[world]
+        group_begin = learner // p.robots * p.robots
+        group_end = group_begin + p.robots
         out[world, :] = 0
         for other in range(pos_x.shape[0]):
             dx, dy = pos_x[other] - pos_x[learner], pos_y[other] - pos_y[learner]
             dist_sq = dx * dx + dy * dy
             if other == learner or dist_sq >= p.outer_sq:
                 continue
-            cell = sector_of(dx, dy, p.sectors) + (0 if dist_sq < p.inner_sq else p.sectors)
-            step = 1 if other // p.robots == learner // p.robots else -1
+            cell = sector_of(dx, dy, edges) + (0 if dist_sq < p.inner_sq else p.sectors)
+            step = 1 if group_begin <= other < group_end else -1
             out[world, cell] = min(max(out[world, cell] + step, -COUNT_LIMIT), COUNT_LIMIT)
 
 
@@ -138,6 +151,7 @@ class SensorMethod(Method):
         """Takes its constants from `config`."""
         self.observation_shape = (2 * config.sectors,)
         self._velocities = heading_velocities(config, np.float32)
+        self._edges = sector_edges(config.sectors)
         real = np.float32
         self._params = packed(
             SensorParams(
@@ -165,7 +179,7 @@ class SensorMethod(Method):
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
         """3.2.1: `[num_worlds, 2q]` counts, the inner disc's q sectors first."""
-        _perceive(state, mask, out, self._params)
+        _perceive(state, mask, out, self._edges, self._params)
 
     def outcome(self, state: WorldState, out: NDArray[np.int8]) -> None:
         """3.2.1: goal, collision, lost or captured; timeout at the horizon (a truncation)."""

@@ -1,4 +1,4 @@
-"""The simulator's yardsticks, in sections: against pyrvo, against RVO2 in C++, by pass, by size, by cores, from the start.
+"""The simulator's yardsticks, in sections: against pyrvo and RVO2 in C++, by pass, by size, by cores, from the start.
 
 All but the section on cores run on one core, with the child processes that they start.
 """

@@ -7,7 +7,7 @@ import pytest
 
 from sim_core.config import WorldConfig
 from sim_core.methods import METHODS, make_method
-from sim_core.methods.sensor import COUNT_LIMIT, heading_velocities, sector_of
+from sim_core.methods.sensor import COUNT_LIMIT, heading_velocities, sector_edges, sector_of
 from sim_core.outcomes import Outcome
 from sim_core.state import empty_state
 
@@ -70,7 +70,17 @@ def test_regions_are_half_open(make_state):
 def test_every_direction_has_a_sector(sectors):
     tiny = REAL(1e-30)
     for x, y in itertools.product((REAL(-1), -tiny, REAL(-0.0), REAL(0.0), tiny, REAL(1)), repeat=2):
-        assert 0 <= sector_of(x, y, sectors) < sectors
+        assert 0 <= sector_of(x, y, sector_edges(sectors)) < sectors
+
+
+@pytest.mark.parametrize("sectors", [2, 3, 4, 5, 7, 8, 12, 16, 64])
+def test_sectors_are_those_of_the_angle(sectors):
+    rng, edges = np.random.default_rng(sectors), sector_edges(sectors)
+    straight = [(x, y) for x, y in itertools.product((-1.0, 0.0, 1.0), repeat=2) if (x, y) != (0, 0)]
+    for x, y in [*straight, *rng.normal(size=(500, 2)).astype(REAL)]:
+        turn = (np.arctan2(y, x) + np.pi) / (2 * np.pi) * sectors
+        exact = round(turn) if abs(turn - round(turn)) < 1e-9 else int(turn)  # an edge belongs to the sector it begins
+        assert sector_of(x, y, edges) == min(exact, sectors - 1)
 
 
 def test_counts_saturate_within_int8(make_state):
@@ -95,11 +105,11 @@ def test_headings_point_to_sector_centres_at_constant_speed(sectors, stop):
     velocities = heading_velocities(config, REAL)
     assert velocities.shape == (config.num_actions, 2)
     for action in range(sectors):
-        assert sector_of(*velocities[action], sectors) == action
+        assert sector_of(*velocities[action], sector_edges(sectors)) == action
         np.testing.assert_allclose(np.hypot(*velocities[action]), 0.7, rtol=1e-6)
         for turn in (-0.49, 0.49):  # nearly to either edge of the sector: so it is the centre
             angle = np.arctan2(velocities[action, 1], velocities[action, 0]) + turn * 2 * np.pi / sectors
-            assert sector_of(REAL(np.cos(angle)), REAL(np.sin(angle)), sectors) == action
+            assert sector_of(REAL(np.cos(angle)), REAL(np.sin(angle)), sector_edges(sectors)) == action
     if stop:
         assert velocities[sectors].tolist() == [0, 0]
 
