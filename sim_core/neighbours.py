@@ -224,7 +224,7 @@ def _search_worlds(row, at, size, num_slots, tile, p):
     entries = entries + select(seen == seen, 1, splat(0))
     limit_sq = minimum(load(tile.distances, p.capacity - 1), splat(p.below_range_sq))
     first = tile.order[row, 0] // size * size
-    last = min(tile.order[row, 7] + 1, num_slots)
+    last = min(tile.order[row, LANES - 1] + 1, num_slots)
     while first < last:
         inside = (robot >= first) & (robot < first + size)
         hits = _count_within(first, first + size, select(inside, limit_sq, p.nowhere), x, y, tile)
