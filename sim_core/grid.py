@@ -50,13 +50,13 @@ def empty_grid(num_slots: int) -> Grid:
 
 @inlined
 def column_of(x, grid):
-    """Column of an x, the nearest one if it lies outside (or is NaN)."""
+    """Column of an x, the nearest one if it lies outside."""
     return min(max(int((x - grid.frame[0]) * grid.frame[2]), 0), grid.shape[0] - 1)
 
 
 @inlined
 def band_of(y, grid):
-    """Band of a y, the nearest one if it lies outside (or is NaN)."""
+    """Band of a y, the nearest one if it lies outside."""
     return min(max(int((y - grid.frame[1]) * grid.frame[2]), 0), grid.shape[1] - 1)
 
 

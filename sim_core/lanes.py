@@ -58,11 +58,13 @@ def _as_lanes(context: Any, builder: Any, value: Any, given: Any, element: Any) 
 
 
 def _element(*arguments: Any) -> Any:
-    """The element type of those arguments that are vectors, or None if they differ or there is none."""
+    """The element type of those arguments that are vectors; None if they differ or a scalar does not fit."""
     found = {argument.element for argument in arguments if isinstance(argument, LanesType)}
     others = [argument for argument in arguments if not isinstance(argument, LanesType)]
-    if len(found) != 1 or not all(isinstance(argument, (types.Number, types.Boolean)) for argument in others):
+    if len(found) != 1 or not all(isinstance(argument, types.Number) for argument in others):
         return None
+    if isinstance(next(iter(found)), types.Integer) and any(isinstance(argument, types.Float) for argument in others):
+        return None  # it would be cut off
     return found.pop()
 
 
@@ -219,6 +221,8 @@ def _vector_pointer(context: Any, builder: Any, array: Any, value: Any, element_
 @intrinsic
 def load(typingctx: Any, array: Any, i: Any) -> Any:
     """Vector i of a C-contiguous array."""
+    if array.layout != "C":
+        return None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         at = builder.mul(context.cast(builder, args[1], sig.args[1], types.intp), ir.Constant(ir.IntType(64), LANES))
@@ -231,6 +235,8 @@ def load(typingctx: Any, array: Any, i: Any) -> Any:
 @intrinsic
 def store(typingctx: Any, array: Any, i: Any, value: Any) -> Any:
     """Writes vector i of a C-contiguous array."""
+    if array.layout != "C":
+        return None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         at = builder.mul(context.cast(builder, args[1], sig.args[1], types.intp), ir.Constant(ir.IntType(64), LANES))

@@ -263,3 +263,17 @@ def test_two_element_types_do_not_mix(function, dtype):
 def test_what_a_vector_cannot_do_is_refused(function):
     with pytest.raises(TypingError, match="Lanes"):
         kernel(function)(np.zeros(LANES, np.float32), np.zeros(LANES, np.float32))
+
+
+def _fraction(a):
+    store(a, 0, load(a, 0) + 0.7)
+
+
+def test_a_fraction_is_not_cut_off_to_fit_whole_numbers():
+    with pytest.raises(TypingError):
+        kernel(_fraction)(np.zeros(LANES, np.int32))
+
+
+def test_a_strided_array_is_refused():
+    with pytest.raises(TypingError):
+        kernel(_fraction)(np.zeros(2 * LANES, np.float32)[::2])
