@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from actors.exploration import explore
 from actors.network import Policy, WeightsSnapshot
-from actors.nstep import NStepAssembler
+from actors.nstep import NStepAssembler, Steps, empty_steps
 from actors.transitions import (
     NO_OUTCOME,
     SCHEMA_VERSION,
@@ -78,12 +78,8 @@ class RolloutWorker:
         """
         if self._policy is None:
             raise RuntimeError("a rollout worker needs weights before it collects")
-        rows: list[NDArray[Any]] = []
-        ended: list[EpisodeStats] = []
-        for _ in range(self._settings.steps_per_block):
-            completed, stats = self._step(self._policy, rate)
-            rows += completed
-            ended += [] if stats is None else [stats]
+        steps = empty_steps(self._settings.steps_per_block, self._settings.num_envs, self._dtype)
+        ended = [self._step(self._policy, rate, steps, i) for i in range(self._settings.steps_per_block)]
         weights = self._policy.weights
         header = BlockHeader(
             schema_version=SCHEMA_VERSION,
@@ -96,19 +92,20 @@ class RolloutWorker:
             env_steps=self._settings.steps_per_block * self._settings.num_envs,
         )
         self._sequence += 1
-        packed = np.concatenate(rows) if rows else np.zeros(0, self._dtype)
-        return TransitionBlock(header, packed, join_stats(ended))
+        return TransitionBlock(header, self._nstep.push(steps), join_stats([stats for stats in ended if stats]))
 
-    def _step(self, policy: Policy, rate: float) -> tuple[list[NDArray[Any]], EpisodeStats | None]:
+    def _step(self, policy: Policy, rate: float, steps: Steps, i: int) -> EpisodeStats | None:
+        """One step of every environment, written as step i of `steps`; the episodes that it ended, if any."""
         action = explore(policy.greedy(self._observation), rate, self._num_actions, self._rng)
         observation, reward, terminated, truncated, infos = self._env.step(action)
         done = terminated | truncated
-        reached = final_observations(observation, done, infos)
-        completed = self._nstep.push(self._observation, action, reward, reached, terminated, done)
+        steps.observation[i], steps.action[i], steps.reward[i] = self._observation, action, reward
+        steps.reached[i] = final_observations(observation, done, infos)
+        steps.terminated[i], steps.done[i] = terminated, done
         self._observation = observation
         self._length += 1
         self._return += reward
-        return completed, self._end_episodes(done, infos) if done.any() else None
+        return self._end_episodes(done, infos) if done.any() else None
 
     def _end_episodes(self, done: NDArray[np.bool_], infos: dict[str, Any]) -> EpisodeStats:
         outcome = infos.get("final_info", {}).get("outcome")

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.nstep import NStepAssembler
+from actors.nstep import NStepAssembler, Steps
 from actors.transitions import transition_dtype
 
 DTYPE = transition_dtype(gym.spaces.Box(-1e6, 1e6, (2,), np.float32))
@@ -30,17 +30,18 @@ def reference(rewards, ends, n_step):
     return rows
 
 
-def push_all(assembler, rewards, ends, steps):
-    """Pushes env steps `steps` of `rewards`, `ends` `[steps, num_envs]`; all rows in the order they came."""
-    rows = [np.zeros(0, DTYPE)]
-    envs = np.arange(rewards.shape[1])
-    for t in steps:
-        seen = np.stack([envs, np.full_like(envs, t)], axis=1).astype(np.float32)
-        reached = seen + np.array([0, 1], np.float32)
-        rows += assembler.push(
-            seen, np.full(len(envs), t % 7), rewards[t], reached, ends[t] == TERMINATES, ends[t] != RUNS
-        )
-    return np.concatenate(rows)
+def steps_of(rewards, ends, steps):
+    """Env steps `steps` of `rewards`, `ends` `[steps, num_envs]`; an observation tells environment and step."""
+    env, t = np.meshgrid(np.arange(rewards.shape[1]), list(steps))
+    seen = np.stack([env, t], axis=-1).astype(np.float32)
+    chosen = ends[list(steps)]
+    return Steps(seen, t % 7, rewards[list(steps)], seen + np.float32([0, 1]), chosen == TERMINATES, chosen != RUNS)
+
+
+def push_all(assembler, rewards, ends, steps, cuts=()):
+    """Pushes env steps in blocks that are cut at `cuts`; all rows in the order they came."""
+    parts = np.split(np.array(steps, np.int64), sorted({cut for cut in cuts if 0 < cut < len(steps)}))
+    return np.concatenate([assembler.push(steps_of(rewards, ends, part)) for part in parts])
 
 
 def of_env(rows, env):
@@ -60,12 +61,12 @@ def histories(draw):
     return rewards, ends
 
 
-@given(history=histories(), n_step=st.integers(1, 5))
-@settings(max_examples=200, deadline=None)
-def test_equals_the_reference_per_environment_and_in_order(history, n_step):
+@given(history=histories(), n_step=st.integers(1, 5), cuts=st.sets(st.integers(1, 13)))
+@settings(max_examples=300, deadline=None)
+def test_equals_the_reference_per_environment_and_in_order(history, n_step, cuts):
     rewards, ends = history
     assembler = NStepAssembler(DTYPE, rewards.shape[1], n_step, DISCOUNT)
-    rows = push_all(assembler, rewards, ends, range(len(rewards)))
+    rows = push_all(assembler, rewards, ends, range(len(rewards)), cuts)
     expected = [reference(rewards[:, env], ends[:, env], n_step) for env in range(rewards.shape[1])]
     assert len(rows) == sum(map(len, expected))
     for env, wanted in enumerate(expected):

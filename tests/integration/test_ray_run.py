@@ -113,7 +113,7 @@ def test_every_transition_is_accounted_for(shoal, tmp_path):
     checkpoint, _ = newest_valid(tmp_path / "runs/r/checkpoints")
     state = checkpoint.state
     shards = state["learner"]["shards"]
-    waiting = [load_file(checkpoint.folder / f"worker-{i}.safetensors")["nstep_count"].sum() for i in range(2)]
+    waiting = [load_file(checkpoint.folder / f"worker-{i}.safetensors")["nstep_waits"].sum() for i in range(2)]
     assert sum(shard["inserted"] for shard in shards) == state["pacing"]["inserted"]
     assert state["pacing"]["inserted"] + sum(waiting) == state["env_steps"]
     assert all(shard["inserted"] > 0 and shard["dropped"] == 0 for shard in shards)
