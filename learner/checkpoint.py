@@ -55,17 +55,20 @@ def write_checkpoint(root: Path, env_steps: int, save_parts: Callable[[Path], di
     sums = {str(path.relative_to(part)): _sha256(path) for path in files}
     (part / MANIFEST).write_text(json.dumps({"format": FORMAT, "env_steps": env_steps, "sha256": sums}))
     _sync(part)
+    old = final.with_name(final.name + ".old")
     if final.exists():
-        shutil.rmtree(final)
+        shutil.rmtree(old, ignore_errors=True)
+        final.rename(old)  # after a crash between here and the next line it still counts
     part.rename(final)
     _sync_folder(root)
+    shutil.rmtree(old, ignore_errors=True)
     return final
 
 
 def keep_newest(root: Path, count: int) -> None:
     """Removes all but the `count` newest checkpoints, and what crashed writers left."""
-    for part in root.glob(f"{PREFIX}*.part"):
-        shutil.rmtree(part, ignore_errors=True)
+    for left in set(root.glob(f"{PREFIX}*")) - set(_folders(root)):
+        shutil.rmtree(left, ignore_errors=True)
     for old in _folders(root)[count:]:
         shutil.rmtree(old, ignore_errors=True)
 
@@ -114,9 +117,9 @@ def newest_valid(root: Path) -> tuple[Checkpoint, list[str]]:
 
 
 def _folders(root: Path) -> list[Path]:
-    """Finished checkpoints, newest first."""
+    """Finished checkpoints, newest first; one that was being replaced counts until its successor is in place."""
     names = (path for path in root.glob(f"{PREFIX}*") if path.is_dir() and path.suffix != ".part")
-    return sorted(names, reverse=True)
+    return sorted((path for path in names if not (path.suffix and path.with_suffix("").exists())), reverse=True)
 
 
 def _sha256(path: Path) -> str:

@@ -87,6 +87,7 @@ class TrainingLoop:
         self._incarnation = 0
         self.env_steps = 0
         self.updates = 0
+        self._saved_at: tuple[int, int] | None = None
         self._due = {"log": config.log_every_env_steps, "eval": config.eval_every_env_steps}
         self._due["checkpoint"] = config.checkpoint_every_env_steps
 
@@ -112,7 +113,8 @@ class TrainingLoop:
                 self._write_row(self._meters.row(self._replay_size(), self._pacer.ratio()))
             if self._is_due("checkpoint", self._config.checkpoint_every_env_steps):
                 self.checkpoint()
-        self.checkpoint()
+        if self._saved_at != (self.env_steps, self.updates):
+            self.checkpoint()
         return self.env_steps >= self._config.total_env_steps
 
     def _send_first_weights(self) -> None:
@@ -215,6 +217,7 @@ class TrainingLoop:
         folder = write_checkpoint(self._checkpoints, self.env_steps, lambda part: self._save(part, offset))
         keep_newest(self._checkpoints, self._config.keep_checkpoints)
         self._observer.checkpoint(folder, offset)
+        self._saved_at = (self.env_steps, self.updates)
         return folder
 
     def _save(self, folder: Path, journal_offset: int) -> dict[str, Any]:

@@ -28,10 +28,19 @@ class Silent:
         pass
 
 
-def train(config, folder: Path) -> None:
+class Listing(Silent):
+    def __init__(self):
+        self.steps = []
+
+    def checkpoint(self, folder, journal_offset):
+        self.steps.append(int(folder.name.removeprefix("step-")))
+
+
+def train(config, folder: Path, observer=None) -> None:
     cluster = process_cluster(config, 0)
     with closing(Journal(folder / "metrics.jsonl", 0)) as journal:
-        assert TrainingLoop(config, cluster, journal, folder / "checkpoints", Silent(), bool).run()
+        loop = TrainingLoop(config, cluster, journal, folder / "checkpoints", observer or Silent(), bool)
+        assert loop.run()
 
 
 def final_state(folder: Path):
@@ -75,6 +84,12 @@ def test_two_runs_of_a_seed_are_the_same_bit_for_bit(small, tmp_path):
     train(small, tmp_path / "one")
     train(small, tmp_path / "two")
     assert_same(final_state(tmp_path / "one"), final_state(tmp_path / "two"))
+
+
+def test_no_checkpoint_is_written_twice(small, tmp_path):
+    listing = Listing()
+    train(dataclasses.replace(small, checkpoint_every_env_steps=small.total_env_steps // 2), tmp_path, listing)
+    assert len(listing.steps) == len(set(listing.steps)) >= 2 and listing.steps[-1] >= small.total_env_steps
 
 
 def test_another_seed_is_another_run(small, tmp_path):

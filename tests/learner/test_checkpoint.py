@@ -4,6 +4,7 @@ import json
 import os
 import random
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -83,6 +84,29 @@ def test_the_folder_gets_its_name_after_everything_is_there_and_synced(tmp_path,
 def test_the_same_step_is_replaced(tmp_path, folder):
     assert write(tmp_path, 1000, seed=5) == folder
     assert read_checkpoint(folder).state["seed"] == 5
+    assert [path.name for path in tmp_path.iterdir()] == ["step-000000001000"]
+
+
+@pytest.mark.parametrize("renames", [0, 1])
+def test_a_crash_while_replacing_leaves_one_of_the_two(tmp_path, folder, monkeypatch, renames):
+    real, done = Path.rename, []
+
+    def crashing(path, target):
+        if len(done) == renames:
+            raise OSError("power cut")
+        done.append(path)
+        return real(path, target)
+
+    monkeypatch.setattr(Path, "rename", crashing)
+    with pytest.raises(OSError, match="power cut"):
+        write(tmp_path, 1000, seed=5)
+    monkeypatch.undo()
+    assert newest_valid(tmp_path)[0].state["seed"] == 4
+    keep_newest(tmp_path, 1)
+    assert newest_valid(tmp_path)[0].state["seed"] == 4
+    assert read_checkpoint(write(tmp_path, 1000, seed=6)).state["seed"] == 6
+    keep_newest(tmp_path, 1)
+    assert [path.name for path in tmp_path.iterdir()] == ["step-000000001000"]
 
 
 def test_a_flipped_bit_anywhere_is_noticed(folder):
