@@ -7,6 +7,7 @@ or not finite; arrivals and segregation are measured, not judged.
 """
 
 import argparse
+import json
 import multiprocessing
 import os
 import sys
@@ -59,8 +60,22 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=list(SECTIONS))
     parser.add_argument("--scenes", type=int, default=12_000, help="scenes with the worlds' own settings")
     parser.add_argument("--episodes", type=int, default=1000, help="episodes of each setup of the swarm alone")
+    parser.add_argument("--setups", nargs="+", type=setup, default=SWARM_SETUPS, help="of the swarm: 25x8 ...")
+    parser.add_argument("--world", nargs="+", type=setting, default=[], help="of the swarm: orca_radius_m=0.16 ...")
     parser.add_argument("--processes", type=int, default=os.cpu_count(), help="1: all in this one")
     return parser.parse_args(argv)
+
+
+def setup(text: str) -> tuple[int, int]:
+    """(robots, groups) of a setup such as 25x8."""
+    robots, groups = text.split("x")
+    return int(robots), int(groups)
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """Name and value of a field of WorldConfig, given as name=value."""
+    name, value = text.split("=")
+    return name, json.loads(value)
 
 
 @contextmanager
@@ -165,12 +180,12 @@ def swarm_section(run: Run, options: argparse.Namespace) -> bool:
     table = new_table(title, "setup", *SWARM_COLUMNS)
     shares = new_table("… share of segregated group pairs at step", "setup", *map(str, work.WATCHED_STEPS))
     ok = True
-    for robots, groups in SWARM_SETUPS:
-        calls = [(robots, groups, seeds) for seeds in parts(options.episodes, 25)]
+    for robots, groups in options.setups:
+        calls = [(robots, groups, seeds, dict(options.world)) for seeds in parts(options.episodes, 25)]
         found = work.joined(run(work.swarm_episodes, calls))
-        setup, arrived = f"{robots}r×{groups}g", found.arrival_step <= work.WHOLE_STEPS
+        name, arrived = f"{robots}r×{groups}g", found.arrival_step <= work.WHOLE_STEPS
         table.add_row(
-            setup,
+            name,
             f"{options.episodes:,}",
             f"{(found.overlap_steps > 0).sum():,}",
             f"{found.overlap_steps.sum():,}",
@@ -179,7 +194,7 @@ def swarm_section(run: Run, options: argparse.Namespace) -> bool:
             f"{100 * arrived.mean():.1f} %",
             f"{np.median(found.arrival_step[arrived]):.0f}" if arrived.any() else "–",
         )
-        shares.add_row(setup, *(f"{share:.3f}" for share in found.segregated.mean(axis=0)))
+        shares.add_row(name, *(f"{share:.3f}" for share in found.segregated.mean(axis=0)))
         ok &= bool(
             (found.fastest_m_s <= found.speed_limit_m_s * SPEED_ROUNDING).all() and not found.overlap_steps.any()
         )

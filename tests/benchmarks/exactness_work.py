@@ -89,9 +89,9 @@ def nearest_pairs_sq(pos_x, pos_y, nearest_sq):
         nearest_sq[world] = least
 
 
-def swarm_episodes(robots: int, groups: int, seeds: range) -> Episodes:
+def swarm_episodes(robots: int, groups: int, seeds: range, settings: dict[str, Any]) -> Episodes:
     """FL-ORCA drives everybody from the start to WHOLE_STEPS, beyond arrivals and collisions."""
-    worlds, count = fresh_worlds(robots, groups, seeds), len(seeds)
+    worlds, count = fresh_worlds(robots, groups, seeds, **settings), len(seeds)
     config, near_sq = worlds.config, np.zeros(count, np.float32)
     nearest_sq, overlaps, fastest = np.full(count, np.inf), np.zeros(count, int), np.zeros(count)
     arrival, segregated = np.full(count, WHOLE_STEPS + 1), []
