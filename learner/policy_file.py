@@ -27,6 +27,6 @@ def read_policy(checkpoint: Checkpoint, config: RunConfig, shape: EnvShape) -> W
     except (RuntimeError, OSError, SafetensorError) as error:
         raise CheckpointError(
             f"the policy of {checkpoint.folder} takes other observations or actions than this setup: name a run whose "
-            "sectors, stop_action and hidden_sizes are those of its config"
+            "sectors, stop_action and hidden_sizes (for M_IN and M_OUT also method and groups) are those of its config"
         ) from error
     return snapshot(network, checkpoint.state["updates"], 0.0)

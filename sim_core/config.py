@@ -27,10 +27,12 @@ class WorldConfig:
     """Robots per group, the 10 of 10r x 2g; the learning robot counts."""
     groups: int = 2
     """Number of groups, the 2 of 10r x 2g."""
-    method: Literal["sensor"] = "sensor"
-    """State representation of the learning robot (`sensor` = M_sensor, Chapter 3)."""
-    swarm_knows_learner: bool = True
-    """Whether the swarm avoids the learning robot and counts it in its flock (M_sensor: yes)."""
+    method: Literal["sensor", "in", "out"] = "sensor"
+    """State representation of the learning robot: M_sensor (Chapter 3), M_IN or M_OUT (Chapter 4)."""
+    swarm_knows_learner: Literal["method", "yes", "no"] = "method"
+    """Whether the swarm avoids the learning robot and counts it in its flock (the method's: M_sensor only)."""
+    horizon_is: Literal["method", "cut", "failure"] = "method"
+    """A timeout cuts and keeps the state's value, or fails with -tau (M_sensor: cuts; M_IN, M_OUT: Alg. 4.1, 4.2)."""
 
     sectors: int = 8
     """q, the number of sectors per sensing region and of headings (not given in the text)."""
@@ -48,6 +50,35 @@ class WorldConfig:
     """tau, the size of the terminal reward (Table 3.2)."""
     reward_clock: Literal["step", "horizon"] = "step"
     """What the step reward tau/eta divides by: the current step (3.2.3) or the horizon (Table 3.2)."""
+
+    outside_limit_steps: int = 100
+    """`in`, `out`: phi, env steps outside the own ellipse, one after the other, that fail (not given in the text)."""
+    ellipse_covariance: Literal["diagonal", "full"] = "diagonal"
+    """`in`, `out`: covariance of a group's positions, with sigma_xy = 0 (4.2.1) or with all of it."""
+    ellipse_axes: Literal["confidence", "printed"] = "confidence"
+    """`in`, `out`: half-axes sqrt(C lambda), the region that C stands for, or half of that as in Eq. 4.3 and 4.4."""
+    ellipse_chi_square: float = 5.991
+    """`in`, `out`: C, quantile of chi^2 with 2 degrees of freedom (Table 4.2; it is that of 95 %)."""
+    ellipse_counts_learner: bool = False
+    """`in`, `out`: whether the learning robot counts in its group's ellipse (open; see methods/ellipse.py)."""
+    ellipse_smallest_half_axis_m: float = 0.01
+    """`in`, `out`: no half-axis is shorter, so that robots in a line span an ellipse (not given in the text)."""
+    group_order: Literal["fixed", "nearest"] = "fixed"
+    """`in`, `out`: order of the other groups' rows, after the own one: around the circle, or by distance (open)."""
+    ellipse_scale_per_m: float = 0.5
+    """`in`, `out`: factor of half-axes and of centres relative to the learning robot (not given in the text)."""
+    goal_scale_per_m: float = 0.15
+    """`in`, `out`: factor of goals relative to the learning robot (not given in the text)."""
+    apf_range_m: float = 0.5
+    """`in`, `out`: range of the repulsive potential (Alg. 4.2: R1)."""
+    apf_gain_m4_s: float = 0.15
+    """`in`, `out`: gain of the repulsive potential (not given in the text)."""
+    apf_limit_m_s: float = 4.0
+    """`in`, `out`: largest u_apf, and largest part of one robot in it (not given in the text)."""
+    apf_rows: Literal["group", "all"] = "group"
+    """`in`: a row's u_apf comes from its own group's robots, as the subscripts say, or from all robots in every row."""
+    learner_speed_limit_m_s: float = 1.0
+    """`out`: largest speed of the sum u_nn + u_apf (not given in the text)."""
 
     time_step_s: float = 0.05
     """dt, simulated time per env step."""
@@ -117,6 +148,22 @@ class WorldConfig:
         return self.sectors + int(self.stop_action)
 
     @property
+    def learner_is_known(self) -> bool:
+        """Whether the swarm knows the learning robot, as `swarm_knows_learner` or the method has it."""
+        return self.method == "sensor" if self.swarm_knows_learner == "method" else self.swarm_knows_learner == "yes"
+
+    @property
+    def timeout_fails(self) -> bool:
+        """Whether a timeout is a terminal failure, as `horizon_is` or the method has it."""
+        return self.method != "sensor" if self.horizon_is == "method" else self.horizon_is == "failure"
+
+    @property
+    def top_speed_m_s(self) -> float:
+        """Largest speed of any robot, the learning robot's too."""
+        learner_m_s = self.learner_speed_limit_m_s if self.method == "out" else self.learner_speed_m_s
+        return max(self.max_speed_m_s, learner_m_s)
+
+    @property
     def setup(self) -> str:
         """The setup as the dissertation writes it, such as `10r×2g`."""
         return f"{self.robots}r×{self.groups}g"
@@ -134,15 +181,27 @@ def _check_counts(config: WorldConfig) -> None:
     )
     require(2 <= config.sectors <= MAX_HEADINGS, f"sectors must be between 2 and {MAX_HEADINGS}, not {config.sectors}")
     require(config.horizon_steps >= 1, f"horizon_steps must be at least 1, not {config.horizon_steps}")
+    require(
+        config.outside_limit_steps >= 1, f"outside_limit_steps must be at least 1, not {config.outside_limit_steps}"
+    )
+    require(
+        config.method == "sensor" or config.ellipse_counts_learner or config.robots >= 3,
+        f"robots must be at least 3 per group for method {config.method!r}, not {config.robots}: an ellipse without "
+        "the learning robot (ellipse_counts_learner) needs two others",
+    )
     require(1 <= config.max_neighbours <= 64, f"max_neighbours must be between 1 and 64, not {config.max_neighbours}")
 
 
 POSITIVE = (
     "inner_radius_m outer_radius_m learner_speed_m_s reward_scale time_step_s arena_radius_m start_spacing_m "
     "robot_radius_m max_speed_m_s orca_radius_m orca_horizon_s neighbour_range_m separation_range_m sight_range_m "
-    "view_range_m uniform_separation_range_m uniform_view_corridor_m uniform_slow_radius_m"
+    "view_range_m uniform_separation_range_m uniform_view_corridor_m uniform_slow_radius_m ellipse_chi_square "
+    "ellipse_smallest_half_axis_m ellipse_scale_per_m goal_scale_per_m apf_range_m apf_limit_m_s "
+    "learner_speed_limit_m_s"
 ).split()
-NON_NEGATIVE = "start_jitter_m separation_noise cohesion_weight separation_weight alignment_weight".split()
+NON_NEGATIVE = (
+    "start_jitter_m separation_noise cohesion_weight separation_weight alignment_weight apf_gain_m4_s"
+).split()
 ANGLES = "separation_angle_deg sight_angle_deg view_angle_deg".split()
 
 
@@ -163,7 +222,12 @@ def _check_lengths(config: WorldConfig) -> None:
         f"orca_radius_m ({config.orca_radius_m}) must be at least robot_radius_m ({config.robot_radius_m}), "
         "or ORCA steers into collisions",
     )
-    step_m = config.time_step_s * max(config.max_speed_m_s, config.learner_speed_m_s)
+    require(
+        config.method != "out" or config.learner_speed_limit_m_s >= config.learner_speed_m_s,
+        f"learner_speed_limit_m_s ({config.learner_speed_limit_m_s}) must be at least learner_speed_m_s "
+        f"({config.learner_speed_m_s}), the speed of u_nn alone",
+    )
+    step_m = config.time_step_s * config.top_speed_m_s
     require(
         step_m <= 2 * config.robot_radius_m,
         f"time_step_s ({config.time_step_s}) lets a robot jump {step_m:.3g} m in a step, past another robot: "

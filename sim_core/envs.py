@@ -8,10 +8,10 @@ Registered as `shoal/SegregatedSwarm-v0`; keyword arguments are the fields of `W
     envs = gym.make_vec("shoal/SegregatedSwarm-v0", num_envs=64, robots=10, groups=2)
 
 Observations, actions, rewards and outcomes are those of the chosen method. A success or failure of the
-task terminates an episode, the horizon truncates it. The vector environment restarts ended worlds in the
-same step (`AutoresetMode.SAME_STEP`): the returned observation is the new episode's first, the ended one's
-last stands in `infos["final_obs"]`, and `infos["final_info"]` holds `outcome`, `episode_length` and
-`episode_return`; the masks `_final_obs` and `_final_info` say where.
+task terminates an episode; the horizon truncates it, unless a timeout is a failure (`horizon_is`). The vector
+environment restarts ended worlds in the same step (`AutoresetMode.SAME_STEP`): the returned observation is the new
+episode's first, the ended one's last stands in `infos["final_obs"]`, and `infos["final_info"]` holds `outcome`,
+`episode_length` and `episode_return`; the masks `_final_obs` and `_final_info` say where.
 """
 
 from __future__ import annotations
@@ -116,8 +116,8 @@ class SwarmEnv(gym.Env[NDArray[Any], np.int64]):
         if outcome != Outcome.RUNNING:
             info["episode_length"] = int(result.steps[0])
             info["episode_return"] = float(result.episode_return[0])
-        terminated = bool(is_terminated(result.outcome)[0])
-        truncated = outcome == Outcome.TIMEOUT
+        terminated = bool(is_terminated(result.outcome, self.config.timeout_fails)[0])
+        truncated = outcome == Outcome.TIMEOUT and not terminated
         return result.observation[0], float(result.reward[0]), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -185,7 +185,8 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
         if not whole or actions.min() < 0 or actions.max() >= self.config.num_actions:
             raise ValueError(f"actions must be {self.num_envs} whole numbers in 0..{self.config.num_actions - 1}")
         result = self.worlds.step(actions.astype(np.int64, copy=False))
-        done, terminated = is_done(result.outcome), is_terminated(result.outcome)
+        done = is_done(result.outcome)
+        terminated = is_terminated(result.outcome, self.config.timeout_fails)
         observation, infos = result.observation, dict[str, Any]()
         if done.any():
             infos = {

@@ -3,6 +3,10 @@
 Spec of the task (3.1, 4.1): success is the mean distance of the learning robot's group to its goal
 (Eq. 3.2) below R2. Failures are told apart as lost and captured (Figure 3.3), collision and timeout.
 Where two hold in one step, the first of collision, goal, lost or captured, timeout counts.
+
+M_sensor fails as soon as the learning robot senses no own robot, M_IN and M_OUT once it has been outside its
+group's ellipse for phi steps. A robot that fails so is captured if it senses, within R2, robots of other groups
+and none of its own; else it is lost.
 """
 
 from __future__ import annotations
@@ -66,12 +70,28 @@ def group_goal_distance_m(group, robots, pos_x, pos_y, goal_x, goal_y):
 
 
 @kernel
-def end_of_step(robot, robots, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m):
-    """Outcome of one world after a step of a robot that is lost once it senses no own robot."""
+def collision_or_goal(robot, robots, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m):
+    """COLLISION or GOAL where one holds after a step, else RUNNING; the same for every method."""
     if collides(robot, pos_x, pos_y, collision_sq):
         return _COLLISION
     if group_goal_distance_m(robot // robots, robots, pos_x, pos_y, goal_x, goal_y) < range_m:
         return _GOAL
+    return _RUNNING
+
+
+@kernel
+def lost_or_captured(robot, robots, pos_x, pos_y, range_sq):
+    """How a robot fails that was outside its group's ellipse for too long."""
+    own, others = sensed(robot, robots, pos_x, pos_y, range_sq)
+    return _CAPTURED if own == 0 and others > 0 else _LOST
+
+
+@kernel
+def end_of_step(robot, robots, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m):
+    """Outcome of one world after a step of a robot that is lost once it senses no own robot."""
+    ended = collision_or_goal(robot, robots, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m)
+    if ended != _RUNNING:
+        return ended
     own, others = sensed(robot, robots, pos_x, pos_y, range_m * range_m)
     if own == 0:
         return _CAPTURED if others > 0 else _LOST

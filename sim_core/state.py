@@ -13,7 +13,8 @@ class WorldState(NamedTuple):
     """All that a batch of worlds needs to go on; structure of arrays, robot i is of group i // robots.
 
     Shapes: pos_*, vel_* `[num_worlds, num_robots]` (metres, m/s); goal_* `[num_worlds, groups]`; learner,
-    steps `[num_worlds]` int32; goal_distance_m `[num_worlds]` (the learning robot's, before the step);
+    steps, outside_steps `[num_worlds]` int32 (env steps so far, and the last ones outside the own ellipse,
+    one after the other); goal_distance_m `[num_worlds]` (the learning robot's, before the step);
     episode_return `[num_worlds]` float64; rng `[num_worlds]` uint64; machine `[num_worlds, num_robots]`
     int8, the FL-ORCA state of the last step.
     """
@@ -26,6 +27,7 @@ class WorldState(NamedTuple):
     goal_y: Any
     learner: Any
     steps: Any
+    outside_steps: Any
     goal_distance_m: Any
     episode_return: Any
     rng: Any
@@ -44,6 +46,7 @@ def empty_state(config: WorldConfig, num_worlds: int, dtype: Any) -> WorldState:
         goal_y=np.zeros(groups, dtype),
         learner=np.zeros(num_worlds, np.int32),
         steps=np.zeros(num_worlds, np.int32),
+        outside_steps=np.zeros(num_worlds, np.int32),
         goal_distance_m=np.zeros(num_worlds, dtype),
         episode_return=np.zeros(num_worlds, np.float64),
         rng=np.zeros(num_worlds, np.uint64),

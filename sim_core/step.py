@@ -48,7 +48,7 @@ class SwarmParams(NamedTuple):
 def swarm_params(config: WorldConfig, dtype: Any) -> SwarmParams:
     """The swarm's constants of `config`."""
     real = np.dtype(dtype).type
-    drift_m = 2.0 * config.time_step_s * max(config.max_speed_m_s, config.learner_speed_m_s)
+    drift_m = 2.0 * config.time_step_s * config.top_speed_m_s
     return SwarmParams(
         orca=orca_params(config.orca_radius_m, config.orca_horizon_s, config.time_step_s, config.max_speed_m_s, dtype),
         flock=flock_params(config, dtype),
@@ -58,7 +58,7 @@ def swarm_params(config: WorldConfig, dtype: Any) -> SwarmParams:
         time_step_s=real(config.time_step_s),
         nowhere=real(np.nan),
         cell_edge_m=config.neighbour_range_m / CELLS_PER_RANGE,
-        knows_learner=config.swarm_knows_learner,
+        knows_learner=config.learner_is_known,
         robots=config.robots,
         groups=config.groups,
         tile_worlds=worlds_per_tile(config.num_robots),
@@ -201,6 +201,7 @@ def restart(state, mask, s):
             s,
         )
         state.steps[world] = 0
+        state.outside_steps[world] = 0
         state.episode_return[world] = 0.0
         learner = state.learner[world]
         group = learner // s.robots

@@ -143,6 +143,6 @@ def is_done(outcome: NDArray[np.int8]) -> NDArray[np.bool_]:
     return np.not_equal(outcome, int(Outcome.RUNNING))
 
 
-def is_terminated(outcome: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """Where an episode has ended for a reason of the task, not of the clock."""
-    return is_done(outcome) & np.not_equal(outcome, int(Outcome.TIMEOUT))
+def is_terminated(outcome: NDArray[np.int8], timeout_fails: bool) -> NDArray[np.bool_]:
+    """Where an episode has reached a terminal state; a timeout is one if it counts as a failure of the task."""
+    return is_done(outcome) & (np.not_equal(outcome, int(Outcome.TIMEOUT)) | timeout_fails)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from sim_core.config import WorldConfig
 from sim_core.methods.base import Method
+from sim_core.methods.inside import InsideMethod
+from sim_core.methods.outside import OutsideMethod
 from sim_core.methods.sensor import SensorMethod
 
-METHODS: dict[str, type[Method]] = {"sensor": SensorMethod}
+METHODS: dict[str, type[Method]] = {"sensor": SensorMethod, "in": InsideMethod, "out": OutsideMethod}
 
 
 def make_method(config: WorldConfig) -> Method:

@@ -39,7 +39,7 @@ class Method(ABC):
 
     @abstractmethod
     def outcome(self, state: WorldState, out: NDArray[np.int8]) -> None:
-        """Writes each world's Outcome `[num_worlds]` after a step."""
+        """Writes each world's Outcome `[num_worlds]` after a step; called once a step, it may count steps."""
 
     @abstractmethod
     def reward(self, state: WorldState, outcome: NDArray[np.int8], out: NDArray[np.float32]) -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sim_core.config import WorldConfig
 from sim_core.jit import kernel
 from sim_core.methods.base import Method
+from sim_core.methods.headings import heading_velocities, write_headings
 from sim_core.outcomes import Outcome, end_of_step
 from sim_core.packed import packed
 from sim_core.state import WorldState
@@ -38,20 +39,7 @@ class SensorParams(NamedTuple):
     horizon_steps: int
     reward_scale: float
     clock_is_step: bool
-
-
-def heading_velocities(config: WorldConfig, dtype: Any) -> NDArray[Any]:
-    """Velocity of every action `[num_actions, 2]`, m/s (Eq. 3.3 and 3.4).
-
-    Action a in 0..q-1 moves towards the centre of sector a. The text counts a from 1 to q+1, of which the
-    last repeats the first heading. A stop action, if there is one, comes last.
-    """
-    q = config.sectors
-    alpha = math.pi / q + np.arange(q) * (2 * math.pi / q) - math.pi
-    velocity = config.learner_speed_m_s * np.stack([np.cos(alpha), np.sin(alpha)], axis=1)
-    if config.stop_action:
-        velocity = np.concatenate([velocity, np.zeros((1, 2))])
-    return velocity.astype(dtype)
+    timeout_fails: bool
 
 
 def sector_edges(sectors: int) -> NDArray[np.float64]:
@@ -123,22 +111,13 @@ def _reward(state, outcome, out, params):
         distance_m = np.sqrt(dx * dx + dy * dy)
         closer = distance_m < state.goal_distance_m[world]
         state.goal_distance_m[world] = distance_m
-        if outcome[world] == _RUNNING or outcome[world] == _TIMEOUT:
+        if outcome[world] == _RUNNING or (outcome[world] == _TIMEOUT and not p.timeout_fails):
             clock = state.steps[world] if p.clock_is_step else p.horizon_steps
             reward = p.reward_scale / clock if closer else -p.reward_scale / clock
         else:
             reward = p.reward_scale if outcome[world] == _GOAL else -p.reward_scale
         out[world] = reward
         state.episode_return[world] += reward
-
-
-@kernel
-def _velocity(table, action, out_x, out_y):
-    for world in range(action.shape[0]):
-        if action[world] < 0 or action[world] >= table.shape[0]:
-            raise ValueError("action must be in 0..num_actions - 1")
-        out_x[world] = table[action[world], 0]
-        out_y[world] = table[action[world], 1]
 
 
 class SensorMethod(Method):
@@ -164,6 +143,7 @@ class SensorMethod(Method):
                 horizon_steps=config.horizon_steps,
                 reward_scale=float(config.reward_scale),
                 clock_is_step=config.reward_clock == "step",
+                timeout_fails=config.timeout_fails,
             )
         )
 
@@ -173,18 +153,16 @@ class SensorMethod(Method):
         Raises:
           ValueError: there is not one action a world, or one is none of the actions.
         """
-        if action.shape != out_x.shape:
-            raise ValueError(f"action must have the shape {out_x.shape}, one a world, not {action.shape}")
-        _velocity(self._velocities, action, out_x, out_y)
+        write_headings(self._velocities, action, out_x, out_y)
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
         """3.2.1: `[num_worlds, 2q]` counts, the inner disc's q sectors first."""
         _perceive(state, mask, out, self._edges, self._params)
 
     def outcome(self, state: WorldState, out: NDArray[np.int8]) -> None:
-        """3.2.1: goal, collision, lost or captured; timeout at the horizon (a truncation)."""
+        """3.2.1: goal, collision, lost or captured; timeout at the horizon."""
         _outcome(state, out, self._params)
 
     def reward(self, state: WorldState, outcome: NDArray[np.int8], out: NDArray[np.float32]) -> None:
-        """Table 3.1, with the robot's own distance to the goal as "closer"; a timeout is an ordinary step."""
+        """Table 3.1, with the robot's own distance to the goal as "closer"; a timeout that is no failure is a step."""
         _reward(state, outcome, out, self._params)

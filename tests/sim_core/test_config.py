@@ -23,7 +23,8 @@ def refuses(field, **settings):
 
 
 @pytest.mark.parametrize(
-    ("robots", "groups", "method"), list(itertools.product((5, 10, 15, 20, 25), (1, 2, 3, 4, 8), ("sensor",)))
+    ("robots", "groups", "method"),
+    list(itertools.product((5, 10, 15, 20, 25), (1, 2, 3, 4, 8), ("sensor", "in", "out"))),
 )
 def test_setups_of_the_dissertation_are_accepted(robots, groups, method):
     config = WorldConfig(robots=robots, groups=groups, method=method)
@@ -93,6 +94,7 @@ def test_angles(name):
         ("sectors", 1, 2, MAX_HEADINGS, MAX_HEADINGS + 1),
         ("horizon_steps", 0, 1, None, None),
         ("max_neighbours", 0, 1, 64, 65),
+        ("outside_limit_steps", 0, 1, None, None),
     ],
 )
 def test_counts(name, below, lowest, highest, above):
@@ -120,6 +122,34 @@ def test_pairs_that_contradict_each_other():
 def test_a_robot_may_not_jump_past_another(speed):
     refuses("time_step_s", **{speed: 5.0})
     WorldConfig(**{speed: 4.0})
+
+
+def test_the_sum_of_two_velocities_may_not_jump_past_another_robot():
+    refuses("time_step_s", method="out", learner_speed_limit_m_s=5.0)
+    WorldConfig(method="out", learner_speed_limit_m_s=4.0)
+    WorldConfig(method="in", learner_speed_limit_m_s=5.0)
+    for field in ("learner_speed_limit_m_s", "learner_speed_m_s"):
+        refuses(field, method="out", learner_speed_limit_m_s=0.9)
+    assert WorldConfig(method="out", learner_speed_limit_m_s=3.0).top_speed_m_s == 3.0
+    assert WorldConfig(method="in", learner_speed_limit_m_s=3.0).top_speed_m_s == 1.0
+
+
+def test_an_ellipse_needs_two_robots_besides_the_learning_robot():
+    for method in ("in", "out"):
+        refuses("robots", method=method, robots=2)
+        WorldConfig(method=method, robots=2, ellipse_counts_learner=True)
+
+
+@pytest.mark.parametrize(
+    ("method", "known", "fails"), [("sensor", True, False), ("in", False, True), ("out", False, True)]
+)
+def test_the_method_decides_what_is_left_to_it(method, known, fails):
+    config = WorldConfig(method=method)
+    assert (config.learner_is_known, config.timeout_fails) == (known, fails)
+    for word, answer in (("yes", True), ("no", False)):
+        assert WorldConfig(method=method, swarm_knows_learner=word).learner_is_known == answer
+    for word, answer in (("failure", True), ("cut", False)):
+        assert WorldConfig(method=method, horizon_is=word).timeout_fails == answer
 
 
 def test_robots_may_not_overlap_at_the_start():

@@ -15,15 +15,19 @@ SETTINGS = {"robots": 4, "groups": 2, "arena_radius_m": 2.0, "horizon_steps": 60
 ENDS = {Outcome.GOAL, Outcome.LOST, Outcome.CAPTURED, Outcome.COLLISION}
 
 
-@pytest.mark.parametrize("settings", [{}, SETTINGS, {"sectors": 5, "stop_action": True}])
+@pytest.mark.parametrize(
+    "settings", [{}, SETTINGS, {"sectors": 5, "stop_action": True}, {"method": "in"}, SETTINGS | {"method": "out"}]
+)
 def test_gymnasium_finds_nothing_to_complain_about(settings):
     check_env(gym.make(ENV_ID, render_mode="rgb_array", **settings).unwrapped)
 
 
+@pytest.mark.parametrize("method", ["sensor", "in", "out"])
 @pytest.mark.parametrize("num_envs", [1, 5])
 @pytest.mark.parametrize("seed", [0, 17, 2**31 - 9])
-def test_the_batch_equals_its_single_environments(num_envs, seed):
-    envs, singles = SwarmVectorEnv(num_envs, **SETTINGS), [SwarmEnv(**SETTINGS) for _ in range(num_envs)]
+def test_the_batch_equals_its_single_environments(num_envs, seed, method):
+    settings = SETTINGS | {"method": method, "outside_limit_steps": 30}
+    envs, singles = SwarmVectorEnv(num_envs, **settings), [SwarmEnv(**settings) for _ in range(num_envs)]
     observation, infos = envs.reset(seed=seed)
     assert infos == {}
     expected = [single.reset(seed=seed + i)[0] for i, single in enumerate(singles)]
@@ -82,6 +86,21 @@ def test_the_horizon_truncates(horizon):
         assert truncated.all() == (step % horizon == 0) and truncated.any() == truncated.all()
     assert (infos["final_info"]["outcome"] == Outcome.TIMEOUT).all()
     assert (infos["final_info"]["episode_length"] == horizon).all()
+
+
+@pytest.mark.parametrize("method", ["in", "out"])
+def test_a_horizon_that_is_a_failure_terminates(method):
+    settings = {"method": method, "horizon_steps": 4}
+    envs, env = SwarmVectorEnv(6, **settings), SwarmEnv(**settings)
+    envs.reset(seed=3)
+    env.reset(seed=3)
+    for step in range(1, 5):
+        _, reward, terminated, truncated, infos = envs.step(np.arange(6))
+        one = env.step(np.int64(0))
+        assert not truncated.any() and terminated.tolist() == [step == 4] * 6
+        assert one[2:4] == (step == 4, False)
+    assert (infos["final_info"]["outcome"] == Outcome.TIMEOUT).all() and (reward == -1).all() and one[1] == -1
+    assert SwarmEnv(horizon_is="cut", **settings).config.timeout_fails is False
 
 
 def test_a_task_that_ends_at_the_horizon_is_no_timeout():

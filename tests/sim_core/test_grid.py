@@ -210,9 +210,9 @@ def test_cells_are_as_small_as_asked_for_where_robots_are_dense():
 
 WORLDS = {
     "25r×8g": {"robots": 25, "groups": 8},
-    "25r×8g, unknown learner": {"robots": 25, "groups": 8, "swarm_knows_learner": False},
+    "25r×8g, unknown learner": {"robots": 25, "groups": 8, "swarm_knows_learner": "no"},
     "17r×9g, uniform": {"robots": 17, "groups": 9, "flocking": "uniform"},
-    "5r×3g, none, unknown learner": {"robots": 5, "groups": 3, "flocking": "none", "swarm_knows_learner": False},
+    "5r×3g, none, unknown learner": {"robots": 5, "groups": 3, "flocking": "none", "swarm_knows_learner": "no"},
 }
 NUM_WORLDS, STEPS = 3, 50
 

@@ -160,6 +160,14 @@ def test_table_3_1(outcome, closer, by_step, by_horizon, clock, make_state):
     assert state.goal_distance_m[0] == pytest.approx(4.0)
 
 
+def test_a_timeout_that_is_a_failure(make_state):
+    config = WorldConfig(robots=2, groups=1, horizon_is="failure")
+    state, reward = make_state(config, [(0, 0), (1, 0)], [(4, 0)]), np.zeros(1, REAL)
+    state.goal_distance_m[0], state.steps[0] = 5.0, 500
+    make_method(config).reward(state, np.array([Outcome.TIMEOUT], np.int8), reward)
+    assert reward[0] == -1
+
+
 def test_an_equal_distance_is_not_closer(make_state):
     config = WorldConfig(robots=2, groups=1)
     state = make_state(config, [(0, 0), (1, 0)], [(4, 0)])

@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from sim_core.outcomes import ENDED, OUTCOME_NAMES, Outcome, collides, end_of_step, group_goal_distance_m, sensed
+from sim_core.outcomes import (
+    ENDED,
+    OUTCOME_NAMES,
+    Outcome,
+    collides,
+    collision_or_goal,
+    end_of_step,
+    group_goal_distance_m,
+    lost_or_captured,
+    sensed,
+)
 
 REAL = np.float32
 RANGE_M, CONTACT_M = 1.5, 0.2
@@ -106,6 +116,20 @@ def test_sensing_and_contact_match_numpy():
         nearest_sq = np.delete(dist_sq, robot).min()
         assert not collides(robot, pos_x, pos_y, nearest_sq)
         assert collides(robot, pos_x, pos_y, np.nextafter(nearest_sq, REAL(9)))
+
+
+def test_lost_or_captured():
+    for pos, expected in ((ALONE, "LOST"), (TOGETHER, "LOST"), (MIXED, "LOST"), (SURROUNDED, "CAPTURED")):
+        pos_x, pos_y = np.ascontiguousarray(np.asarray(pos, REAL).T)
+        assert lost_or_captured(ROBOT, 2, pos_x, pos_y, REAL(RANGE_M) ** 2) == Outcome[expected]
+
+
+def test_collision_or_goal_knows_nothing_of_lost():
+    goal_x, goal_y = np.array([0, FAR], REAL), np.array([0, FAR], REAL)
+    for mate, expected in ((2.9, "GOAL"), (3.1, "RUNNING"), (0.1, "COLLISION")):
+        pos_x, pos_y = np.array([0, mate, 9, -9], REAL), np.array([0, 0, 9, -9], REAL)
+        found = collision_or_goal(ROBOT, 2, pos_x, pos_y, goal_x, goal_y, REAL(CONTACT_M) ** 2, REAL(RANGE_M))
+        assert found == Outcome[expected]
 
 
 def test_names_and_ends():

@@ -20,7 +20,8 @@ SETUPS = {  # robots, groups, arena radius (m; small, so that groups meet soon),
 def batch(name, seeds):
     """A freshly reset batch of one world a seed."""
     robots, groups, arena_radius_m, knows = SETUPS[name]
-    config = WorldConfig(robots=robots, groups=groups, arena_radius_m=arena_radius_m, swarm_knows_learner=knows)
+    known = "yes" if knows else "no"
+    config = WorldConfig(robots=robots, groups=groups, arena_radius_m=arena_radius_m, swarm_knows_learner=known)
     worlds = WorldBatch(config, len(seeds))
     worlds.seed(seeds)
     worlds.reset()
@@ -83,7 +84,7 @@ def somewhere(pos, learner, rng):
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(robots=st.integers(2, 12), groups=st.integers(1, 4), num_worlds=st.integers(1, 9), seed=st.integers(0, 10**6))
 def test_wherever_an_unknown_learning_robot_is_put_nobody_else_changes(robots, groups, num_worlds, seed):
-    config = WorldConfig(robots=robots, groups=groups, arena_radius_m=2.0, swarm_knows_learner=False)
+    config = WorldConfig(robots=robots, groups=groups, arena_radius_m=2.0, swarm_knows_learner="no")
     calm, haunted = WorldBatch(config, num_worlds), WorldBatch(config, num_worlds)
     for worlds in (calm, haunted):
         worlds.seed(list(range(seed, seed + num_worlds)))

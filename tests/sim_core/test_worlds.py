@@ -46,11 +46,12 @@ def test_same_seed_same_run():
     assert not np.array_equal(other.state.pos_x, batch(SEEDS).state.pos_x)
 
 
-def test_a_batch_equals_its_worlds_one_by_one():
-    together, plan = batch(SEEDS), actions(120, 8)
+@pytest.mark.parametrize("method", ["sensor", "in", "out"])
+def test_a_batch_equals_its_worlds_one_by_one(method):
+    together, plan = batch(SEEDS, method=method), actions(120, 8)
     results = run(together, plan)
     for i, seed in enumerate(SEEDS):
-        alone = batch([seed])
+        alone = batch([seed], method=method)
         for (a, pos_a), (b, pos_b) in zip(results, run(alone, plan[:, i : i + 1]), strict=True):
             np.testing.assert_array_equal(pos_a[i], pos_b[0])
             for x, y in zip(a, b, strict=True):
@@ -67,12 +68,24 @@ def test_a_push_in_one_world_changes_no_other():
     assert not np.array_equal(first.state.pos_x[3], second.state.pos_x[3])
 
 
+@pytest.mark.parametrize("method", ["in", "out"])
+def test_the_ellipse_methods_are_unknown_to_the_swarm(method):
+    runs = []
+    for seed in (1, 2):
+        worlds = batch(SEEDS, method=method)
+        path = np.array([pos for _, pos in run(worlds, actions(60, 8, seed))])
+        keep = np.arange(10) != worlds.state.learner[:, None]
+        runs.append((path[:, keep], path[:, ~keep]))
+    np.testing.assert_array_equal(runs[0][0], runs[1][0])
+    assert not np.array_equal(runs[0][1], runs[1][1])
+
+
 @pytest.mark.parametrize("flocking", ["published", "uniform"])
 @pytest.mark.parametrize("known", [False, True])
 def test_the_swarm_reacts_to_the_learning_robot_only_if_it_knows_it(known, flocking):
     runs = []
     for seed in (1, 2, None):  # two random pilots, and FL-ORCA
-        worlds = batch(SEEDS, swarm_knows_learner=known, flocking=flocking)
+        worlds = batch(SEEDS, swarm_knows_learner="yes" if known else "no", flocking=flocking)
         plan = [None] * 120 if seed is None else actions(120, 8, seed)
         path = np.array([pos for _, pos in run(worlds, plan)])
         keep = np.arange(10) != worlds.state.learner[:, None]
@@ -83,7 +96,7 @@ def test_the_swarm_reacts_to_the_learning_robot_only_if_it_knows_it(known, flock
 
 
 def test_an_unknown_learning_robot_can_be_run_over():
-    worlds = batch([7], swarm_knows_learner=False)
+    worlds = batch([7], swarm_knows_learner="no")
     learner = int(worlds.state.learner[0])
     mate = (learner + 1) % 5 + 5 * (learner // 5)
     worlds.state.pos_x[0, learner], worlds.state.pos_y[0, learner] = worlds.positions()[0, mate]
@@ -102,8 +115,9 @@ def test_a_pilot_moves_the_learning_robot_by_its_heading():
     np.testing.assert_allclose(worlds.positions()[rows, learner] - before, expected, atol=1e-6)
 
 
-def test_a_saved_batch_goes_on_bit_for_bit():
-    first, plan = batch(SEEDS), actions(80, 8)
+@pytest.mark.parametrize("method", ["sensor", "in", "out"])
+def test_a_saved_batch_goes_on_bit_for_bit(method):
+    first, plan = batch(SEEDS, method=method), actions(80, 8)
     run(first, plan[:40])
     second = WorldBatch(first.config, 8)
     second.set_state(first.get_state())
@@ -172,7 +186,15 @@ def test_the_horizon_cuts_at_its_step_exactly():
         assert result.steps.tolist() == [step, step]
         expected = Outcome.TIMEOUT if step == 7 else Outcome.RUNNING
         assert result.outcome.tolist() == [expected] * 2
-    assert is_done(result.outcome).all() and not is_terminated(result.outcome).any()
+    assert is_done(result.outcome).all() and not is_terminated(result.outcome, False).any()
+    assert is_terminated(result.outcome, True).all()
+
+
+def test_what_is_terminal():
+    every = np.array(list(Outcome), np.int8)
+    names = {Outcome.GOAL, Outcome.LOST, Outcome.CAPTURED, Outcome.COLLISION}
+    assert {Outcome(o) for o in every[is_terminated(every, False)]} == names
+    assert {Outcome(o) for o in every[is_terminated(every, True)]} == names | {Outcome.TIMEOUT}
 
 
 def test_returns_add_up_and_restart():

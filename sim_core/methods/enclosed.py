@@ -1,0 +1,209 @@
+"""What M_IN and M_OUT share: the state matrix of group ellipses, outcome and reward (Chapter 4).
+
+The matrix has one row a group (4.2.1), the learning robot's own group first. Centres and goals are relative to the
+learning robot, in the world's frame, which is the frame of the headings. Lengths are scaled (`ellipse_scale_per_m`,
+`goal_scale_per_m`), angles are in radians. The other groups follow by number from the own one on, which is their
+order around the start circle, or by the distance of their centres.
+
+The episode fails where the learning robot has been outside its own ellipse for phi steps running: 4.2.1 and 4.2.3 name
+this, the collision and the goal as terminal. The row "Lost" of Table 4.1 is read as just that.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_core.config import WorldConfig, start_grid_radius_m
+from sim_core.jit import kernel
+from sim_core.methods.apf import FieldParams, field_of, field_params
+from sim_core.methods.base import Method
+from sim_core.methods.ellipse import (
+    NOBODY,
+    EllipseParams,
+    ellipse_params,
+    group_centre,
+    group_ellipse,
+    in_own_ellipse,
+    left_out_of,
+)
+from sim_core.outcomes import Outcome, collision_or_goal, lost_or_captured
+from sim_core.packed import packed
+from sim_core.state import WorldState
+
+ELLIPSE_COLUMNS = 7
+"""a, b, x_c, y_c, theta, x_g, y_g."""
+FIELD_COLUMNS = 2
+"""u_apf_x, u_apf_y."""
+STEP_REWARD_SHARE = 100.0
+"""A step's reward is tau divided by this (Table 4.1)."""
+
+_RUNNING, _GOAL, _TIMEOUT = int(Outcome.RUNNING), int(Outcome.GOAL), int(Outcome.TIMEOUT)
+
+
+class EnclosedParams(NamedTuple):
+    """Constants of the ellipse methods."""
+
+    ellipse: EllipseParams
+    field: FieldParams
+    groups: int
+    nearest_first: bool
+    ellipse_scale: float
+    goal_scale: float
+    limit: float
+    columns: int
+    field_of_all: bool
+    outer_m: Any
+    outer_sq: Any
+    collision_sq: Any
+    outside_limit_steps: int
+    horizon_steps: int
+    timeout_fails: bool
+    reward_scale: float
+
+
+@kernel
+def _order_groups(learner, pos_x, pos_y, order, distance_sq, p):
+    """Fills `order` `[groups]`: the own group, then the others as the settings say; `distance_sq` is scratch."""
+    robots = p.ellipse.robots
+    own = learner // robots
+    order[0] = own
+    for place in range(1, p.groups):
+        group = (own + place) % p.groups
+        at = place
+        if p.nearest_first:
+            x, y, _ = group_centre(group, robots, pos_x, pos_y, NOBODY)
+            dx, dy = x - pos_x[learner], y - pos_y[learner]
+            near = dx * dx + dy * dy
+            while at > 1 and distance_sq[at - 1] > near:
+                order[at], distance_sq[at] = order[at - 1], distance_sq[at - 1]
+                at -= 1
+            distance_sq[at] = near
+        order[at] = group
+
+
+@kernel
+def _write_row(group, learner, pos_x, pos_y, goal_x, goal_y, out, at, p):
+    """Writes one group's row to `out[at:at + columns]`."""
+    robots = p.ellipse.robots
+    a, b, x_c, y_c, theta = group_ellipse(group, pos_x, pos_y, left_out_of(learner, p.ellipse), p.ellipse)
+    out[at], out[at + 1] = a * p.ellipse_scale, b * p.ellipse_scale
+    out[at + 2] = (x_c - pos_x[learner]) * p.ellipse_scale
+    out[at + 3] = (y_c - pos_y[learner]) * p.ellipse_scale
+    out[at + 4] = theta
+    out[at + 5] = (goal_x[group] - pos_x[learner]) * p.goal_scale
+    out[at + 6] = (goal_y[group] - pos_y[learner]) * p.goal_scale
+    if p.columns > ELLIPSE_COLUMNS:
+        begin = 0 if p.field_of_all else group * robots
+        end = p.groups * robots if p.field_of_all else begin + robots
+        out[at + 7], out[at + 8] = field_of(learner, begin, end, pos_x, pos_y, p.field)
+    for i in range(at, at + p.columns):
+        out[i] = min(max(out[i], -p.limit), p.limit)
+
+
+@kernel
+def _perceive(state, mask, out, order, distance_sq, params):
+    p = params[0]
+    for world in range(mask.shape[0]):
+        if not mask[world]:
+            continue
+        pos_x, pos_y, learner = state.pos_x[world], state.pos_y[world], state.learner[world]
+        _order_groups(learner, pos_x, pos_y, order, distance_sq, p)
+        for row in range(p.groups):
+            goal_x, goal_y = state.goal_x[world], state.goal_y[world]
+            _write_row(order[row], learner, pos_x, pos_y, goal_x, goal_y, out[world], row * p.columns, p)
+
+
+@kernel
+def _outcome(state, out, params):
+    p = params[0]
+    for world in range(out.shape[0]):
+        pos_x, pos_y, learner = state.pos_x[world], state.pos_y[world], state.learner[world]
+        goal_x, goal_y = state.goal_x[world], state.goal_y[world]
+        inside = in_own_ellipse(learner, pos_x, pos_y, p.ellipse)
+        state.outside_steps[world] = 0 if inside else state.outside_steps[world] + 1
+        robots = p.ellipse.robots
+        ended = collision_or_goal(learner, robots, pos_x, pos_y, goal_x, goal_y, p.collision_sq, p.outer_m)
+        if ended == _RUNNING and state.outside_steps[world] >= p.outside_limit_steps:
+            ended = lost_or_captured(learner, robots, pos_x, pos_y, p.outer_sq)
+        if ended == _RUNNING and state.steps[world] >= p.horizon_steps:
+            ended = _TIMEOUT
+        out[world] = ended
+
+
+@kernel
+def _reward(state, outcome, out, params):
+    p = params[0]
+    for world in range(out.shape[0]):
+        if outcome[world] == _RUNNING or (outcome[world] == _TIMEOUT and not p.timeout_fails):
+            share = p.reward_scale / STEP_REWARD_SHARE
+            reward = share if state.outside_steps[world] == 0 else -share
+        else:
+            reward = p.reward_scale if outcome[world] == _GOAL else -p.reward_scale
+        out[world] = reward
+        state.episode_return[world] += reward
+
+
+def observation_limit(config: WorldConfig) -> float:
+    """A bound of every observation: no robot gets farther from the arena's centre than its speed takes it."""
+    travel_m = config.horizon_steps * config.time_step_s * config.top_speed_m_s
+    reach_m = config.arena_radius_m + start_grid_radius_m(config) + travel_m
+    offset = 2 * reach_m * max(config.ellipse_scale_per_m, config.goal_scale_per_m)
+    spread_m = math.sqrt(2) * reach_m  # the variance of n points is at most n / (n - 1) times the reach squared
+    half_axis_m = max(math.sqrt(config.ellipse_chi_square) * spread_m, config.ellipse_smallest_half_axis_m)
+    return float(
+        np.float32(1.01 * max(offset, half_axis_m * config.ellipse_scale_per_m, config.apf_limit_m_s, math.pi))
+    )
+
+
+class EnclosedMethod(Method):
+    """State matrix, outcome and reward of the ellipse methods.
+
+    Args:
+      config: the setup.
+      columns: elements of a group's row.
+    """
+
+    observation_dtype = np.float32
+
+    def __init__(self, config: WorldConfig, columns: int = ELLIPSE_COLUMNS) -> None:
+        self.observation_shape = (config.groups * columns,)
+        self.observation_limit = observation_limit(config)
+        self._order = np.zeros(config.groups, np.int32)
+        self._distance_sq = np.zeros(config.groups, np.float64)
+        real = np.float32
+        self._params = packed(
+            EnclosedParams(
+                ellipse=ellipse_params(config),
+                field=field_params(config),
+                groups=config.groups,
+                nearest_first=config.group_order == "nearest",
+                ellipse_scale=float(config.ellipse_scale_per_m),
+                goal_scale=float(config.goal_scale_per_m),
+                limit=self.observation_limit,
+                columns=columns,
+                field_of_all=config.apf_rows == "all",
+                outer_m=real(config.outer_radius_m),
+                outer_sq=real(config.outer_radius_m) ** 2,
+                collision_sq=real(2 * config.robot_radius_m) ** 2,
+                outside_limit_steps=config.outside_limit_steps,
+                horizon_steps=config.horizon_steps,
+                timeout_fails=config.timeout_fails,
+                reward_scale=float(config.reward_scale),
+            )
+        )
+
+    def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.float32]) -> None:
+        """4.2.1: the state matrix `[num_worlds, groups * columns]`, row after row."""
+        _perceive(state, mask, out, self._order, self._distance_sq, self._params)
+
+    def outcome(self, state: WorldState, out: NDArray[np.int8]) -> None:
+        """4.2.1: goal, collision, lost or captured after phi steps outside, timeout; counts `outside_steps`."""
+        _outcome(state, out, self._params)
+
+    def reward(self, state: WorldState, outcome: NDArray[np.int8], out: NDArray[np.float32]) -> None:
+        """Table 4.1: +tau/100 inside the own ellipse, -tau/100 outside, +-tau at the end."""
+        _reward(state, outcome, out, self._params)

@@ -1,0 +1,46 @@
+"""The action space that all methods share: q headings at constant speed (Eq. 3.3 and 3.4)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_core.config import WorldConfig
+from sim_core.jit import kernel
+
+
+def heading_velocities(config: WorldConfig, dtype: Any) -> NDArray[Any]:
+    """Velocity of every action `[num_actions, 2]`, m/s (Eq. 3.3 and 3.4).
+
+    Action a in 0..q-1 moves towards the centre of sector a. The text counts a from 1 to q+1, of which the
+    last repeats the first heading. A stop action, if there is one, comes last.
+    """
+    q = config.sectors
+    alpha = math.pi / q + np.arange(q) * (2 * math.pi / q) - math.pi
+    velocity = config.learner_speed_m_s * np.stack([np.cos(alpha), np.sin(alpha)], axis=1)
+    if config.stop_action:
+        velocity = np.concatenate([velocity, np.zeros((1, 2))])
+    return velocity.astype(dtype)
+
+
+@kernel
+def _write_headings(table, action, out_x, out_y):
+    for world in range(action.shape[0]):
+        if action[world] < 0 or action[world] >= table.shape[0]:
+            raise ValueError("action must be in 0..num_actions - 1")
+        out_x[world] = table[action[world], 0]
+        out_y[world] = table[action[world], 1]
+
+
+def write_headings(table: NDArray[Any], action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
+    """Writes u_nn `[num_worlds]` (m/s): row `action[world]` of `table` `[num_actions, 2]`.
+
+    Raises:
+      ValueError: there is not one action a world, or one is none of the actions.
+    """
+    if action.shape != out_x.shape:
+        raise ValueError(f"action must have the shape {out_x.shape}, one a world, not {action.shape}")
+    _write_headings(table, action, out_x, out_y)
