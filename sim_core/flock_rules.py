@@ -40,7 +40,6 @@ class FlockParams(NamedTuple):
 
     rules: int
     weights: Any
-    robots: int
     separation_range_sq: Any
     separation_cos: Any
     separation_noise: Any
@@ -81,7 +80,6 @@ def flock_params(config: WorldConfig, dtype: Any) -> FlockParams:
     return FlockParams(
         rules=("none", "published", "uniform").index(config.flocking),
         weights=flock_weights(config, dtype),
-        robots=config.robots,
         separation_range_sq=real(config.separation_range_m) ** 2,
         separation_cos=cosine(config.separation_angle_deg),
         separation_noise=real(config.separation_noise),

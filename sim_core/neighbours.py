@@ -77,7 +77,7 @@ def clear_lists(reach_sq, distances, neighbours, at, capacity):
 
 @inlined
 def _comes_before(dist_sq, slot, there_sq, there):
-    """Where a candidate belongs before a list's entry: nearer, or as near and of lower index."""
+    """Where a robot belongs before a list's entry: nearer, or as near and of lower index."""
     return (dist_sq < there_sq) | ((dist_sq == there_sq) & (slot < there))
 
 
@@ -190,7 +190,7 @@ def _sort_pass(count, tile, at):
     far_sq, far = load(tile.distances, 0), load(tile.neighbours, at)
     for k in range(1, count):
         next_sq, following = load(tile.distances, k), load(tile.neighbours, at + k)
-        swap = (next_sq < far_sq) | ((next_sq == far_sq) & (following < far))
+        swap = _comes_before(next_sq, following, far_sq, far)
         moved = moved | swap
         store(tile.distances, k - 1, select(swap, next_sq, far_sq))
         store(tile.neighbours, at + k - 1, select(swap, following, far))
@@ -203,7 +203,7 @@ def _sort_pass(count, tile, at):
 
 @inlined
 def _count_within(first, last, limit_sq, x, y, tile):
-    """How many of the candidates lie within `limit_sq` (inclusive; NaN for robots that do not ask)."""
+    """How many of the candidates lie within `limit_sq` (inclusive; negative for robots that do not ask)."""
     hits = splat(0)
     for candidate in range(first, last):
         dx, dy = x - tile.seen_x[candidate], y - tile.seen_y[candidate]

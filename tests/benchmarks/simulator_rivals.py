@@ -18,7 +18,7 @@ from rich.table import Table
 from sim_core.config import WorldConfig
 from sim_core.worlds import WorldBatch, is_done
 from tests.benchmarks.rvo2 import Rvo2Driver
-from tests.benchmarks.timing import Timed, ratio, spread, timed_rates
+from tests.benchmarks.timing import Timed, ratio, seconds_of_steps, spread, timed_rates
 
 SETUPS = ((5, 2), (10, 4), (25, 4), (25, 8))
 NUM_WORLDS = 64
@@ -151,13 +151,7 @@ def orca_work(config: WorldConfig) -> Callable[[], Timed]:
     episodes = orca_episodes(config)
 
     def work() -> Timed:
-        seconds = 0.0
-        for _ in range(episodes):
-            worlds.set_state(start)
-            start_s = time.perf_counter()
-            for _ in range(EPISODE_STEPS):
-                worlds.swarm_step()
-            seconds += time.perf_counter() - start_s
+        seconds = sum(seconds_of_steps(worlds, start, EPISODE_STEPS) for _ in range(episodes))
         return Timed(episodes * EPISODE_STEPS * NUM_WORLDS * config.num_robots, seconds)
 
     return work

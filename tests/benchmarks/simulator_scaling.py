@@ -12,7 +12,6 @@ with many worlds, which has as many robots a call as the largest world.
 """
 
 import math
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -21,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from sim_core.config import WorldConfig
 from sim_core.worlds import WorldBatch
-from tests.benchmarks.timing import Timed, spread, timed_rates
+from tests.benchmarks.timing import Timed, seconds_of_steps, spread, timed_rates
 
 SIZES = ((100, 1), (1_000, 1), (10_000, 1), (100, 100))  # robots a world, worlds; the first is the measure
 GROUPS = 4
@@ -58,13 +57,8 @@ def step_work(worlds: WorldBatch) -> Callable[[], Timed]:
     robot_steps = STEPS * worlds.num_worlds * worlds.config.num_robots
 
     def work() -> Timed:
-        repeats, seconds = max(1, ROBOT_STEPS // robot_steps), 0.0
-        for _ in range(repeats):
-            worlds.set_state(start)
-            start_s = time.perf_counter()
-            for _ in range(STEPS):
-                worlds.swarm_step()
-            seconds += time.perf_counter() - start_s
+        repeats = max(1, ROBOT_STEPS // robot_steps)
+        seconds = sum(seconds_of_steps(worlds, start, STEPS) for _ in range(repeats))
         return Timed(repeats * robot_steps, seconds)
 
     return work
