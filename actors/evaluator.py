@@ -1,92 +1,178 @@
-"""Greedy evaluation on fixed seeds: one episode a seed, so that short episodes are not over-counted."""
+"""Evaluation on fixed seeds: one episode a seed, so that short episodes are not over-counted.
+
+Learned policies, which act greedily, and baselines are played by the same loop.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.baselines import Baseline, Player, make_baseline
 from actors.calls import Calls, Ref
 from actors.network import Policy, WeightsSnapshot
 from actors.rollout import join_stats
-from actors.trajectory import Episode
+from actors.trajectory import NO_ACTION, Episode
 from actors.transitions import NO_OUTCOME, EpisodeStats
 from actors.vector_env import EnvSpec, make_vector_env, reset_seeded
+from sim_core.checks import require
+from sim_core.config import WorldConfig
+from sim_core.outcomes import Outcome
 from sim_core.worlds import WorldBatch, is_done
 
 MAX_ENVS = 250
 """Environments stepped at once."""
 
+Candidate = WeightsSnapshot | Baseline
+"""What is evaluated, as data that travels to where it plays: a learned policy's weights, or a baseline's name."""
 
-def evaluate(spec: EnvSpec, weights: WeightsSnapshot, seeds: list[int]) -> EpisodeStats:
-    """Plays the greedy policy for one episode from each seed.
+
+class GreedyPolicy:
+    """A learned policy that takes the action of the highest value; implements `actors.baselines.Player`.
+
+    Args:
+      weights: the snapshot to act with.
+    """
+
+    def __init__(self, weights: WeightsSnapshot) -> None:
+        self._policy = Policy(weights)
+
+    def act(self, observation: NDArray[Any]) -> NDArray[np.int64]:
+        """Best actions `[batch]`; the lowest index among equals."""
+        return self._policy.greedy(observation)
+
+
+def make_player(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> Player:
+    """What chooses the candidate's actions in one episode a seed, all played at once.
+
+    Raises:
+      ConfigError: a baseline is to play in an environment that is not ours.
+    """
+    if isinstance(candidate, WeightsSnapshot):
+        return GreedyPolicy(candidate)
+    require(spec.is_swarm, f"the baseline {candidate} plays in our own environment only, not in {spec.env_id}")
+    return make_baseline(candidate, spec.world, seeds)
+
+
+def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> EpisodeStats:
+    """Plays one episode from each seed.
+
+    Returns:
+      One entry a seed, in order.
+
+    Raises:
+      ConfigError: see `make_player`.
+    """
+    chunks = [seeds[i : i + MAX_ENVS] for i in range(0, len(seeds), MAX_ENVS)]
+    return join_stats([_play(spec, make_player(spec, candidate, chunk), chunk) for chunk in chunks])
+
+
+def evaluate_in_parts(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: list[int], parts: int) -> EpisodeStats:
+    """`evaluate` as up to `parts` calls at once; `candidate` refers to a Candidate.
 
     Returns:
       One entry a seed, in order.
     """
-    policy = Policy(weights)
-    chunks = [seeds[i : i + MAX_ENVS] for i in range(0, len(seeds), MAX_ENVS)]
-    return join_stats([_play(spec, policy, chunk) for chunk in chunks])
-
-
-def evaluate_in_parts(calls: Calls, spec: EnvSpec, weights: Ref, seeds: list[int], parts: int) -> EpisodeStats:
-    """`evaluate` as up to `parts` calls at once; `weights` refers to a WeightsSnapshot.
-
-    Returns:
-      One entry a seed; their order is not that of the seeds.
-    """
-    refs = [calls.run(evaluate, spec, weights, seeds[i::parts]) for i in range(min(parts, len(seeds)))]
+    parts = min(parts, len(seeds))
+    bounds = [len(seeds) * i // parts for i in range(parts + 1)] if parts else []
+    refs = [calls.run(evaluate, spec, candidate, seeds[begin:end]) for begin, end in pairwise(bounds)]
     return join_stats([calls.get(ref) for ref in refs])
 
 
-def _play(spec: EnvSpec, policy: Policy, seeds: list[int]) -> EpisodeStats:
+class _Step(NamedTuple):
+    """What a step of every episode gave `[batch, ...]`; `outcome` is of those that ended."""
+
+    observation: NDArray[Any]
+    reward: NDArray[np.float64]
+    ended: NDArray[np.bool_]
+    outcome: NDArray[np.int8]
+
+
+class _Worlds:
+    """Our own worlds, which FL-ORCA may drive; ended ones are stepped on, to no effect on others."""
+
+    def __init__(self, config: WorldConfig, seeds: list[int]) -> None:
+        self._worlds = WorldBatch(config, len(seeds))
+        self._worlds.seed(seeds)
+
+    def start(self) -> NDArray[Any]:
+        return self._worlds.reset()
+
+    def step(self, action: NDArray[np.int64] | None) -> _Step:
+        result = self._worlds.step(action)
+        return _Step(result.observation, result.reward.astype(np.float64), is_done(result.outcome), result.outcome)
+
+    def close(self) -> None:
+        pass
+
+
+class _Environments:
+    """Environments of any Gymnasium id; ended ones restart, and their next episodes count for nothing."""
+
+    def __init__(self, spec: EnvSpec, seeds: list[int]) -> None:
+        self._env = make_vector_env(spec, len(seeds))
+        self._seeds = seeds
+
+    def start(self) -> NDArray[Any]:
+        return reset_seeded(self._env, self._seeds)
+
+    def step(self, action: NDArray[np.int64] | None) -> _Step:
+        observation, reward, terminated, truncated, infos = self._env.step(action)
+        outcome = infos.get("final_info", {}).get("outcome")
+        if outcome is None:
+            outcome = np.full(len(self._seeds), NO_OUTCOME, np.int8)
+        return _Step(observation, reward, terminated | truncated, outcome)
+
+    def close(self) -> None:
+        self._env.close()
+
+
+def _play(spec: EnvSpec, player: Player, seeds: list[int]) -> EpisodeStats:
     count = len(seeds)
     stats = EpisodeStats(np.full(count, NO_OUTCOME, np.int8), np.zeros(count, np.int32), np.zeros(count))
-    env = make_vector_env(spec, count)
-    observation = reset_seeded(env, seeds)
+    stage = _Worlds(spec.world, seeds) if spec.is_swarm else _Environments(spec, seeds)
+    observation = stage.start()
     running = np.ones(count, np.bool_)
     while running.any():
-        observation, reward, terminated, truncated, infos = env.step(policy.greedy(observation))
+        observation, reward, done, outcome = stage.step(player.act(observation))
         stats.length_steps[running] += 1
         stats.episode_return[running] += reward[running]
-        ended = running & (terminated | truncated)
-        if ended.any():
-            outcome = infos.get("final_info", {}).get("outcome")
-            if outcome is not None:
-                stats.outcome[ended] = outcome[ended]
-            running &= ~ended
-    env.close()
+        ended = running & done
+        stats.outcome[ended] = outcome[ended]
+        running &= ~ended
+    stage.close()
     return stats
 
 
-def record_episode(spec: EnvSpec, weights: WeightsSnapshot, seed: int) -> Episode:
-    """Plays one greedy episode of our own environment and keeps every state."""
+def record_episode(spec: EnvSpec, candidate: Candidate, seed: int) -> Episode:
+    """Plays one episode of our own environment and keeps every state."""
     worlds = WorldBatch(spec.world, 1)
-    policy = Policy(weights)
+    player = make_player(spec, candidate, [seed])
     worlds.seed([seed])
     observation = worlds.reset()
     states, actions, rewards = [_state_of(worlds)], list[int](), list[float]()
-    outcome = 0
-    while not outcome:
-        action = policy.greedy(observation)
+    outcome = Outcome.RUNNING
+    while outcome == Outcome.RUNNING:
+        action = player.act(observation)
         result = worlds.step(action)
-        observation = result.observation
+        observation, outcome = result.observation, Outcome(result.outcome[0])
         states.append(_state_of(worlds))
-        actions.append(int(action[0]))
+        actions.append(NO_ACTION if action is None else int(action[0]))
         rewards.append(float(result.reward[0]))
-        outcome = int(result.outcome[0]) if is_done(result.outcome)[0] else 0
     position, velocity, machine = (np.stack(column) for column in zip(*states, strict=True))
     return Episode(
         position=position,
         velocity=velocity,
         machine=machine,
-        action=np.array([*actions, -1], np.int64),
+        action=np.array([*actions, NO_ACTION], np.int64),
         reward=np.array([*rewards, 0.0], np.float32),
         goal=worlds.goals()[0],
         learner=int(worlds.state.learner[0]),
-        outcome=outcome,
+        outcome=int(outcome),
         seed=seed,
     )
 

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from sim_core.config import WorldConfig
 
 FORMAT = "shoal-trajectories-1"
+NO_ACTION = -1
+"""Action of a step that FL-ORCA drove, and of the ended state."""
 
 
 class Episode(NamedTuple):
@@ -24,7 +26,7 @@ class Episode(NamedTuple):
 
     Shapes: position, velocity `[T + 1, num_robots, 2]` float32 (metres, m/s); machine `[T + 1, num_robots]`
     int8 (sim_core.flock_rules.STATE_NAMES); action `[T + 1]` int64 and reward `[T + 1]` float32, taken in and
-    received for the state of the same row (last row: -1 and 0); goal `[groups, 2]` float32.
+    received for the state of the same row (last row: NO_ACTION and 0); goal `[groups, 2]` float32.
     """
 
     position: NDArray[np.float32]
@@ -73,7 +75,9 @@ def load_episodes(path: Path) -> tuple[list[Episode], WorldConfig]:
     try:
         root = zarr.open_group(str(path), mode="r")
     except (FileNotFoundError, zarr.errors.GroupNotFoundError) as error:
-        raise ValueError(f"{path} holds no recorded episodes; name a folder that `shoal watch` wrote") from error
+        raise ValueError(
+            f"{path} holds no recorded episodes; name a folder that `shoal watch` or `shoal evaluate --record` wrote"
+        ) from error
     if root.attrs.get("format") != FORMAT:
         raise ValueError(f"{path} is not in format {FORMAT}; record the episodes again")
     try:

@@ -14,7 +14,6 @@ from dashboards.player import player_html
 from dashboards.video import episode_frames, write_mp4
 from learner.config import RunConfig
 from learner.journal import Row
-from learner.loop import FINAL_EVAL_SEED
 from learner.results import as_metrics, outcome_label
 from learner.run import RunResult
 from learner.run_folder import RunFolder
@@ -34,7 +33,8 @@ def log_artifacts(folder: RunFolder, config: RunConfig, tracker: Tracker, result
     if config.env.is_swarm:
         made += _swarm_animation(folder, config, result.weights)
     else:
-        made += foreign_animation(config, result.weights, FINAL_EVAL_SEED, folder.artifacts / "episode.mp4")
+        path = folder.artifacts / "episode.mp4"
+        made += foreign_animation(config, result.weights, config.final_eval_first_seed, path)
     for path in made:
         tracker.artifact(path)
     with warnings.catch_warnings():
@@ -85,7 +85,7 @@ def _swarm_animation(folder: RunFolder, config: RunConfig, weights: WeightsSnaps
 
 
 def _first_success(config: RunConfig, weights: WeightsSnapshot) -> Episode:
-    episodes = (record_episode(config.env, weights, FINAL_EVAL_SEED + i) for i in range(EPISODES_TRIED))
+    episodes = (record_episode(config.env, weights, config.final_eval_first_seed + i) for i in range(EPISODES_TRIED))
     first = next(episodes)
     if first.outcome == Outcome.GOAL:
         return first

@@ -14,7 +14,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import tyro  # noqa: E402
 
-from deploy.options import Command, Evaluate, Resume, Train, Watch  # noqa: E402
+from deploy.options import Command, Evaluate, Report, Resume, Sweep, Train, Watch  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
 from sim_core.checks import ConfigError  # noqa: E402
 
@@ -58,6 +58,8 @@ def parse(arguments: Sequence[str]) -> Command:
     default = Train(config=path, run=read_config_file(path)) if path else Train()
     commands: Any = (
         Annotated[Train, tyro.conf.subcommand("train", default=default)]
+        | Annotated[Sweep, tyro.conf.subcommand("sweep")]
+        | Annotated[Report, tyro.conf.subcommand("report")]
         | Annotated[Resume, tyro.conf.subcommand("resume")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
         | Annotated[Watch, tyro.conf.subcommand("watch")]
@@ -68,7 +70,7 @@ def parse(arguments: Sequence[str]) -> Command:
         prog="shoal",
         args=list(arguments),
         config=options,
-        description="Teach one robot to move with its swarm: train, resume, evaluate and watch.",
+        description="Teach one robot to move with its swarm: train, sweep, report, resume, evaluate and watch.",
     )
     return command
 
@@ -79,6 +81,14 @@ def execute(command: Command) -> int:
         from deploy import training
 
         return training.train(command) if isinstance(command, Train) else training.resume(command)
+    if isinstance(command, Sweep):
+        from deploy.sweep import sweep
+
+        return sweep(command)
+    if isinstance(command, Report):
+        from deploy.report import report
+
+        return report(command)
     from deploy import playing
 
     return playing.evaluate(command) if isinstance(command, Evaluate) else playing.watch(command)

@@ -10,6 +10,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from learner.config import RunConfig
+from learner.sweep import SweepConfig
 from sim_core.checks import require
 
 
@@ -37,6 +38,10 @@ class Launch:
         """Artifact folder of a new experiment: beside a local database, else the server's choice."""
         return str(self.runs_dir.absolute() / "mlartifacts") if self.tracking().startswith("sqlite:") else None
 
+    def sweep_experiment(self, name: str) -> str:
+        """MLflow experiment of a sweep: the given one, or one of its own."""
+        return f"sweep {name}" if self.experiment == type(self).experiment else self.experiment
+
     def ray_address(self) -> str | None:
         """The Ray cluster in force, None for a Ray of its own."""
         return ray_address(self.address)
@@ -60,6 +65,33 @@ class Train:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """Train and evaluate a grid of setups; the same command again goes on where it was killed."""
+
+    grid: SweepConfig = field(default_factory=SweepConfig)
+    """Which setups."""
+    launch: Launch = field(default_factory=Launch)
+    """Where; the name is that of the sweep, its preset's by default."""
+    at_once: int | None = None
+    """Cells trained at once; one a CPU of the cluster by default."""
+    known: Path | None = None
+    """Results of an earlier sitting (a results.csv): cells that it holds in full are not run again."""
+
+    def __post_init__(self) -> None:
+        require(self.at_once is None or self.at_once >= 1, f"--at-once must be at least 1, not {self.at_once}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Draw a sweep's figures and judge the dissertation's claims from its table of results."""
+
+    results: Positional[Path]
+    """A results.csv that `shoal sweep` wrote, or one of those in dashboards/results."""
+    out: Path = Path("runs/report")
+    """Folder for report.md, claims.md and the figures."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Resume:
     """Go on with a run from its newest usable checkpoint."""
 
@@ -75,18 +107,24 @@ class Resume:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Play the greedy policy of a run on fixed seeds and print its rates with 95 % intervals."""
+    """Play a run's greedy policy, or a baseline, on fixed seeds and print its rates with 95 % intervals."""
 
     run: Positional[str]
-    """Name of the run, or its folder."""
+    """Name of the run, or its folder; or fl-orca, greedy or random (a run of such a name: ./NAME)."""
     episodes: int = 1_000
-    """Greedy episodes."""
+    """Episodes to play."""
     first_seed: int = 2_000_000_000
     """Seed of the first episode; the others count on."""
+    method: Literal["sensor", "in", "out"] | None = None
+    """Baselines only: method of the world to play in; sensor by default."""
     robots: int | None = None
-    """Robots per group to play on, if not those of the training (Extrapolation)."""
+    """Robots per group; by default those of the training (others: Extrapolation), or 10 for a baseline."""
     groups: int | None = None
-    """Groups to play on, if not those of the training (Extrapolation)."""
+    """Groups; by default those of the training (others: Extrapolation), or 2 for a baseline."""
+    out: Path | None = None
+    """New file (.zarr) for the results: seed, outcome, length and return of every episode."""
+    record: int = 0
+    """Records the first episodes whole, this many, beside the results in FILE-episodes.zarr; needs --out."""
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
     address: str | None = None
@@ -97,6 +135,15 @@ class Evaluate:
         require(
             0 <= self.first_seed <= 2**32 - 1 - self.episodes,
             f"--first-seed must be in 0..{2**32 - 1 - self.episodes}, not {self.first_seed}",
+        )
+        require(
+            0 <= self.record <= self.episodes,
+            f"--record must be in 0..{self.episodes} (--episodes), not {self.record}",
+        )
+        require(self.record == 0 or self.out is not None, "--record needs --out: episodes lie beside the results")
+        require(
+            self.out is None or (self.out.suffix == ".zarr" and bool(self.out.stem)),
+            f"--out must name a file that ends in .zarr, not {str(self.out)!r}",
         )
 
 
@@ -119,4 +166,4 @@ class Watch:
         require(0 <= self.seed < 2**32, f"--seed must be in 0..{2**32 - 1}, not {self.seed}")
 
 
-Command = Train | Resume | Evaluate | Watch
+Command = Train | Sweep | Report | Resume | Evaluate | Watch

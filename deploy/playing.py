@@ -1,59 +1,129 @@
-"""`shoal evaluate` and `shoal watch`: a trained policy at work."""
+"""`shoal evaluate` and `shoal watch`: a trained policy, or a baseline, at work."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 from rich.console import Console
 
-from actors.evaluator import record_episode
+from actors.baselines import Baseline
+from actors.evaluation_store import StoredEvaluation, refuse_existing, save_evaluation
+from actors.evaluator import Candidate, record_episode
 from actors.network import WeightsSnapshot
 from actors.trajectory import save_episodes
-from actors.vector_env import env_shape
+from actors.vector_env import EnvSpec, env_shape
 from dashboards.strip import episode_strip_png
 from deploy.artifacts import foreign_animation, write_player, write_video
 from deploy.options import Evaluate, Watch, ray_address
 from deploy.tables import evaluation_table
 from learner.checkpoint import newest_valid
 from learner.config import RunConfig
-from learner.policy_file import read_policy
+from learner.policy_file import read_policy, read_saved_policy
 from learner.ray_edge import evaluate_in_tasks
 from learner.results import summarise
 from learner.run_folder import RunFolder, find_run
-from sim_core.checks import require
+from sim_core import ENV_ID
+from sim_core.checks import ConfigError, require
+from sim_core.config import WorldConfig
 from sim_core.outcomes import OUTCOME_NAMES
 
 
+class Entry(NamedTuple):
+    """What `shoal evaluate` plays: where, with what, and what it is called."""
+
+    spec: EnvSpec
+    candidate: Candidate
+    player: str
+    updates: int
+    title: str
+
+
 def _load(folder: RunFolder, config: RunConfig) -> WeightsSnapshot:
+    shape = env_shape(config.env)
+    if folder.policy.is_file() and not folder.checkpoints.exists():  # a sweep keeps its runs' policies alone
+        return read_saved_policy(folder.policy, config, shape)
     checkpoint, skipped = newest_valid(folder.checkpoints)
     for reason in skipped:
         Console(stderr=True).print(f"skipped: {reason}", highlight=False)
-    return read_policy(checkpoint, config, env_shape(config.env))
+    return read_policy(checkpoint, config, shape)
 
 
 def evaluate(command: Evaluate) -> int:
-    """Prints a run's rates; returns the exit code."""
-    folder = find_run(command.run, command.runs_dir)
-    config = _on_setup(folder.config(), command.robots, command.groups)
-    weights = _load(folder, config)
+    """Prints the rates of a run's policy or a baseline, and stores what `--out` asks for; returns the exit code."""
+    entry = _baseline_entry(command) if command.run in list(Baseline) else _run_entry(command)
+    if command.out is not None:
+        _check_outputs(command.out, command.record, entry.spec)
     seeds = list(range(command.first_seed, command.first_seed + command.episodes))
-    evaluation = summarise(evaluate_in_tasks(config.env, weights, seeds, ray_address(command.address)))
-    title = f"{config.world.method} {config.world.setup}" if config.env.is_swarm else config.env_id
-    Console().print(evaluation_table(evaluation, title))
+    stats = evaluate_in_tasks(entry.spec, entry.candidate, seeds, ray_address(command.address))
+    kind = "episodes" if isinstance(entry.candidate, Baseline) else "greedy episodes"
+    Console().print(evaluation_table(summarise(stats), entry.title, kind))
+    if command.out is not None:
+        _record(command.out, entry, seeds[: command.record])
+        seed = np.array(seeds, np.int64)
+        save_evaluation(command.out, StoredEvaluation(entry.spec, entry.player, entry.updates, seed, stats))
+        Console().print(str(command.out), highlight=False, soft_wrap=True)
     return 0
 
 
-def _on_setup(config: RunConfig, robots: int | None, groups: int | None) -> RunConfig:
-    if robots is None and groups is None:
-        return config
-    require(config.env.is_swarm, f"--robots and --groups apply to our own environment, not to {config.env_id}")
-    world = dataclasses.replace(
-        config.world,
-        robots=config.world.robots if robots is None else robots,
-        groups=config.world.groups if groups is None else groups,
+def _baseline_entry(command: Evaluate) -> Entry:
+    baseline = Baseline(command.run)
+    world = _on_setup(WorldConfig(method=command.method or WorldConfig.method), command)
+    title = f"{baseline}, {world.method} {world.setup}"
+    return Entry(EnvSpec(ENV_ID, world), baseline, str(baseline), 0, title)
+
+
+def _run_entry(command: Evaluate) -> Entry:
+    require(
+        command.method is None,
+        f"--method is for the baselines {', '.join(Baseline)}; the run {command.run!r} has a method of its own",
     )
-    return dataclasses.replace(config, world=world)
+    folder = find_run(command.run, command.runs_dir)
+    config = folder.config()
+    resized = command.robots is not None or command.groups is not None
+    require(
+        config.env.is_swarm or not resized,
+        f"--robots and --groups apply to our own environment, not to {config.env_id}",
+    )
+    config = dataclasses.replace(config, world=_on_setup(config.world, command))
+    weights = _load(folder, config)
+    title = f"{config.world.method} {config.world.setup}" if config.env.is_swarm else config.env_id
+    return Entry(config.env, weights, folder.path.name, weights.version, title)
+
+
+def _on_setup(world: WorldConfig, command: Evaluate) -> WorldConfig:
+    return dataclasses.replace(
+        world,
+        robots=world.robots if command.robots is None else command.robots,
+        groups=world.groups if command.groups is None else command.groups,
+    )
+
+
+def episodes_path(out: Path) -> Path:
+    """Where `--record` writes trajectories: beside the results, `FILE-episodes.zarr`."""
+    return out.with_name(f"{out.stem}-episodes{out.suffix}")
+
+
+def _check_outputs(out: Path, record: int, spec: EnvSpec) -> None:
+    refuse_existing(out)
+    if record:
+        require(spec.is_swarm, f"--record applies to our own environment, not to {spec.env_id}")
+        refuse_existing(episodes_path(out))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out {out} cannot be written ({error}); name a folder that you may write to") from error
+    require(os.access(out.parent, os.W_OK), f"--out {out} cannot be written; name a folder that you may write to")
+
+
+def _record(out: Path, entry: Entry, seeds: list[int]) -> None:
+    if seeds:
+        episodes = [record_episode(entry.spec, entry.candidate, seed) for seed in seeds]
+        save_episodes(episodes_path(out), episodes, entry.spec.world)
+        Console().print(str(episodes_path(out)), highlight=False, soft_wrap=True)
 
 
 def watch(command: Watch) -> int:

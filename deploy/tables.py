@@ -6,15 +6,16 @@ import shlex
 
 from rich.table import Table
 
+from actors.estimates import Estimate
 from learner.checkpoint import newest_valid
-from learner.results import Estimate, Evaluation, outcome_label
+from learner.results import Evaluation, outcome_label
 from learner.run import RunResult
 from learner.run_folder import RunFolder
 
 
-def evaluation_table(evaluation: Evaluation, title: str) -> Table:
+def evaluation_table(evaluation: Evaluation, title: str, kind: str = "greedy episodes") -> Table:
     """Every outcome's rate, the return and the length, with 95 % intervals."""
-    table = Table(title=f"{title}: {evaluation.episodes} greedy episodes", title_justify="left")
+    table = Table(title=f"{title}: {evaluation.episodes} {kind}", title_justify="left")
     table.add_column("result")
     table.add_column("value", justify="right")
     table.add_column("95 % interval", justify="right")

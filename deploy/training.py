@@ -24,16 +24,9 @@ from learner.tracker import Tracker
 from sim_core.checks import ConfigError, require
 
 
-def run_name(config: RunConfig) -> str:
-    """The run's name in MLflow, such as `sensor 10r x 2g s0`."""
-    if not config.env.is_swarm:
-        return f"{config.env_id} s{config.seed}"
-    return f"{config.world.method} {config.world.setup} s{config.seed}"
-
-
 def _new_folder(config: RunConfig, launch: Launch) -> RunFolder:
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    base = run_name(config).replace("×", "").replace(" ", "-").replace("/", "-")
+    base = config.name.replace("×", "").replace(" ", "-").replace("/", "-")
     folder = launch.runs_dir / (launch.name or f"{base}-{stamp}")
     require(
         not folder.exists(),
@@ -50,16 +43,21 @@ def train(command: Train) -> int:
         f"--name must be a plain folder name, not {launch.name!r}",
     )
     folder = _new_folder(config, launch)
-    _make_folder(launch.runs_dir)
+    make_folder(launch.runs_dir)
     env_shape(config.env)  # refuses an environment that cannot be made
     tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
-    tracker.start(config, run_name(config), config.world.method if config.env.is_swarm else "none")
+    tracker.start(config)
     folder.save_config(config)
-    folder.save_identity(RunIdentity(run_name(config), tracker.uri, launch.experiment, tracker.run_id))
+    folder.save_identity(RunIdentity(config.name, tracker.uri, launch.experiment, tracker.run_id))
     return _run(folder, config, tracker, None, launch.ray_address())
 
 
-def _make_folder(path: Path) -> None:
+def make_folder(path: Path) -> None:
+    """Makes a folder for runs.
+
+    Raises:
+      ConfigError: it cannot be made.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -110,7 +108,7 @@ def _run(
         console.print(f"stopped by {name} at {result.env_steps:,} env steps; checkpoint saved", highlight=False)
         console.print(f"go on with: {resume_command(folder)}", highlight=False, soft_wrap=True)
         return 128 + (result.stopped_by or 0)
-    console.print(evaluation_table(result.evaluation, run_name(config)))
+    console.print(evaluation_table(result.evaluation, config.name))
     for line in summary_lines(folder, result, tracker.uri, config.env.is_swarm):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     return 0

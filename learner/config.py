@@ -93,6 +93,8 @@ class RunConfig:
     """Greedy episodes of an evaluation during training."""
     final_eval_episodes: int = 1_000
     """Greedy episodes of the evaluation at the end."""
+    final_eval_first_seed: int = 2_000_000_000
+    """Seed of the first of them; the others count on."""
     log_every_env_steps: int = 20_000
     """Env steps between two rows of training metrics."""
     checkpoint_every_env_steps: int = 500_000
@@ -109,6 +111,12 @@ class RunConfig:
     def env(self) -> EnvSpec:
         """The environment of rollout workers and evaluators."""
         return EnvSpec(self.env_id, self.world)
+
+    @property
+    def name(self) -> str:
+        """What people call a run of this config, such as `sensor 10r×2g s0`."""
+        what = f"{self.world.method} {self.world.setup}" if self.env.is_swarm else self.env_id
+        return f"{what} s{self.seed}"
 
     @property
     def epsilon_settings(self) -> Exploration:
@@ -145,6 +153,11 @@ def _check_ranges(config: RunConfig) -> None:
     for name in AT_LEAST_ONE:
         require(getattr(config, name) >= 1, f"{name} must be at least 1, not {getattr(config, name)}")
     require(0 <= config.seed < 2**31, f"seed must be in 0..{2**31 - 1}, not {config.seed}")
+    last = 2**32 - 1 - config.final_eval_episodes
+    require(
+        0 <= config.final_eval_first_seed <= last,
+        f"final_eval_first_seed must be in 0..{last}, not {config.final_eval_first_seed}",
+    )
     for name in ("epsilon_start", "epsilon_end", "ladder_base"):
         require(0 <= getattr(config, name) <= 1, f"{name} must be between 0 and 1, not {getattr(config, name)}")
     require(0 < config.discount <= 1, f"discount must be in (0, 1], not {config.discount}")

@@ -22,12 +22,10 @@ from learner.journal import Journal, Row
 from learner.meters import Meters
 from learner.node import UpdateReport
 from learner.pacing import PacingState, make_pacer
-from learner.results import Evaluation, as_metrics, summarise
+from learner.results import as_metrics, summarise
 
 EVAL_SEED = 1_000_000_000
 """First seed of evaluations during training; training worlds draw theirs from other streams."""
-FINAL_EVAL_SEED = 2_000_000_000
-"""First seed of the evaluation at the end."""
 
 
 class Observer(Protocol):
@@ -255,11 +253,11 @@ class TrainingLoop:
         self._meters.set_state(state["meters"])
         self._due = dict(state["due"])
 
-    def final_evaluation(self) -> Evaluation:
-        """Evaluates the newest weights over `final_eval_episodes`, in parallel tasks."""
-        seeds = list(range(FINAL_EVAL_SEED, FINAL_EVAL_SEED + self._config.final_eval_episodes))
-        parts = self._cluster.eval_tasks
-        return summarise(evaluate_in_parts(self._calls, self._config.env, self._weights, seeds, parts))
+    def final_evaluation(self) -> EpisodeStats:
+        """Plays the newest weights over `final_eval_episodes`, in parallel tasks."""
+        first = self._config.final_eval_first_seed
+        seeds = list(range(first, first + self._config.final_eval_episodes))
+        return evaluate_in_parts(self._calls, self._config.env, self._weights, seeds, self._cluster.eval_tasks)
 
     def newest_weights(self) -> WeightsSnapshot:
         """The weights that `final_evaluation` plays."""

@@ -1,11 +1,14 @@
-"""Reading a trained policy out of a checkpoint, without starting the run."""
+"""A trained policy as a file of its own, or read out of a checkpoint without starting the run."""
 
 from __future__ import annotations
 
-from safetensors import SafetensorError
-from safetensors.torch import load_file
+from pathlib import Path
 
-from actors.network import QNetwork, WeightsSnapshot, snapshot
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from actors.network import QNetwork, WeightsSnapshot, load_snapshot, snapshot
 from actors.vector_env import EnvShape
 from learner.checkpoint import Checkpoint, CheckpointError
 from learner.config import RunConfig
@@ -19,14 +22,44 @@ def read_policy(checkpoint: Checkpoint, config: RunConfig, shape: EnvShape) -> W
     Raises:
       CheckpointError: the weights do not fit a network of `config` on environments of `shape`.
     """
+    return _read(checkpoint.folder / "learner.safetensors", checkpoint.state["updates"], config, shape)
+
+
+def save_policy(path: Path, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> None:
+    """Writes a policy to a file of its own; an older one is replaced once the new is whole."""
+    network = QNetwork(shape.observation_size, config.hidden_sizes, shape.num_actions)
+    load_snapshot(network, weights)
+    tensors = {f"{ONLINE}{name}": tensor for name, tensor in network.state_dict().items()}
+    part = path.with_name(path.name + ".part")
+    save_file(tensors, str(part), metadata={"updates": str(weights.version)})
+    part.replace(path)
+
+
+def read_saved_policy(path: Path, config: RunConfig, shape: EnvShape) -> WeightsSnapshot:
+    """The policy that `save_policy` wrote.
+
+    Raises:
+      CheckpointError: the file cannot be read, or does not fit a network of `config` on environments of `shape`.
+    """
+    try:
+        with safe_open(str(path), "pt") as file:
+            updates = int((file.metadata() or {})["updates"])
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        raise CheckpointError(f"the policy {path} cannot be read ({error}); train anew") from error
+    return _read(path, updates, config, shape)
+
+
+def _read(path: Path, updates: int, config: RunConfig, shape: EnvShape) -> WeightsSnapshot:
     network = QNetwork(shape.observation_size, config.hidden_sizes, shape.num_actions)
     try:
-        tensors = load_file(str(checkpoint.folder / "learner.safetensors"))
-        online = {name.removeprefix(ONLINE): tensor for name, tensor in tensors.items() if name.startswith(ONLINE)}
-        network.load_state_dict(online)
+        network.load_state_dict(_online(load_file(str(path))))
     except (RuntimeError, OSError, SafetensorError) as error:
         raise CheckpointError(
-            f"the policy of {checkpoint.folder} takes other observations or actions than this setup: name a run whose "
+            f"the policy of {path.parent} takes other observations or actions than this setup: name a run whose "
             "sectors, stop_action and hidden_sizes (for M_IN and M_OUT also method and groups) are those of its config"
         ) from error
-    return snapshot(network, checkpoint.state["updates"], 0.0)
+    return snapshot(network, updates, 0.0)
+
+
+def _online(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(ONLINE): tensor for name, tensor in tensors.items() if name.startswith(ONLINE)}

@@ -15,8 +15,7 @@ import ray
 from ray.actor import ActorHandle
 
 from actors.calls import LocalCalls, Node, Ref
-from actors.evaluator import evaluate_in_parts
-from actors.network import WeightsSnapshot
+from actors.evaluator import Candidate, evaluate_in_parts
 from actors.nodes import RolloutNode, ShardNode
 from actors.transitions import EpisodeStats
 from actors.vector_env import EnvSpec, env_shape
@@ -123,15 +122,18 @@ def connect(cpus: int, address: str | None) -> None:
         )
 
 
-def evaluate_in_tasks(spec: EnvSpec, weights: WeightsSnapshot, seeds: list[int], address: str | None) -> EpisodeStats:
-    """Plays one greedy episode a seed in Ray tasks on all CPUs (see `connect` for errors).
+def evaluate_in_tasks(spec: EnvSpec, candidate: Candidate, seeds: list[int], address: str | None) -> EpisodeStats:
+    """Plays one episode a seed in Ray tasks on all CPUs (see `connect` for errors).
 
     Returns:
-      One entry a seed; their order is not that of the seeds.
+      One entry a seed, in order.
     """
     connect(1, address)
     calls = RayCalls()
-    return evaluate_in_parts(calls, spec, calls.put(weights), seeds, _cluster_cpus())
+    try:
+        return evaluate_in_parts(calls, spec, calls.put(candidate), seeds, _cluster_cpus())
+    finally:
+        ray.shutdown()
 
 
 def ray_cluster(config: RunConfig, incarnation: int, address: str | None) -> Cluster:

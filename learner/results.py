@@ -1,44 +1,13 @@
-"""Rates, means and their confidence intervals from ended episodes."""
+"""Summary of ended episodes: rates, means and their confidence intervals, as metrics."""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
-import numpy as np
-from scipy import stats as scipy_stats
-
+from actors.estimates import Estimate, mean, rate
 from actors.transitions import NO_OUTCOME, EpisodeStats
 from sim_core.outcomes import ENDED, Outcome
-
-CONFIDENCE = 0.95
-
-
-class Estimate(NamedTuple):
-    """A value with its 95 % confidence interval."""
-
-    value: float
-    low: float
-    high: float
-
-
-def rate(count: int, total: int) -> Estimate:
-    """Share of successes with its Wilson interval (Wilson 1927).
-
-    Raises:
-      ValueError: there are no trials.
-    """
-    interval = scipy_stats.binomtest(count, total).proportion_ci(CONFIDENCE, method="wilson")
-    return Estimate(count / total, float(interval.low), float(interval.high))
-
-
-def mean(values: np.ndarray) -> Estimate:
-    """Mean with its Student t interval; the interval is the value where it has no width."""
-    centre = float(np.mean(values))
-    if len(values) < 2:
-        return Estimate(centre, centre, centre)
-    half = scipy_stats.t.ppf(0.5 + CONFIDENCE / 2, len(values) - 1) * scipy_stats.sem(values)
-    return Estimate(centre, float(centre - half), float(centre + half))
 
 
 class Evaluation(NamedTuple):

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from actors.network import WeightsSnapshot
+from actors.transitions import EpisodeStats
 from learner.checkpoint import Checkpoint, CheckpointError, newest_valid
 from learner.cluster import Cluster, process_cluster
 from learner.config import RunConfig, config_hash
 from learner.journal import Journal, PushedMark, Row
 from learner.loop import TrainingLoop
 from learner.ray_edge import ray_cluster
-from learner.results import Evaluation, final_metrics
+from learner.results import Evaluation, final_metrics, summarise
 from learner.run_folder import RunFolder
 from learner.stopping import stop_on_signals
 from learner.tracker import Tracker
@@ -33,12 +34,13 @@ class Display(Protocol):
 
 
 class RunResult(NamedTuple):
-    """How a run ended; `evaluation` and `weights` are None if a signal stopped it before its end."""
+    """How a run ended; `evaluation`, its `episodes` and `weights` are None if a signal stopped it before its end."""
 
     env_steps: int
     updates: int
     stopped_by: int | None
     evaluation: Evaluation | None
+    episodes: EpisodeStats | None
     weights: WeightsSnapshot | None
 
 
@@ -165,7 +167,7 @@ def _train(
             _restore(loop, checkpoint)
         finished = loop.run()
         if not finished:
-            return RunResult(loop.env_steps, loop.updates, stop.signal, None, None)
+            return RunResult(loop.env_steps, loop.updates, stop.signal, None, None, None)
         display.message(f"training done; evaluating {config.final_eval_episodes} greedy episodes")
-        evaluation, weights = loop.final_evaluation(), loop.newest_weights()
-        return RunResult(loop.env_steps, loop.updates, None, evaluation, weights)
+        episodes, weights = loop.final_evaluation(), loop.newest_weights()
+        return RunResult(loop.env_steps, loop.updates, None, summarise(episodes), episodes, weights)

@@ -33,6 +33,7 @@ class RunFolder:
         self.journal = self.path / "metrics.jsonl"
         self.pushed = self.path / "metrics.pushed"
         self.artifacts = self.path / "artifacts"
+        self.policy = self.path / "policy.safetensors"
 
     def save_config(self, config: RunConfig) -> None:
         """Writes `config.json`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -27,9 +28,13 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Turns SIGINT and SIGTERM into a StopRequest; enter after Ray has started, which sets its own handlers."""
+    """Turns SIGINT and SIGTERM into a StopRequest; enter after Ray has started, which sets its own handlers.
+
+    Only a process's main thread can be asked so; in another one, such as a cell of a sweep, the request never comes.
+    """
     request = StopRequest()
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    is_main = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGINT, signal.SIGTERM) if is_main else ()
     before = {number: signal.signal(number, request.handle) for number in numbers}
     try:
         yield request

@@ -88,21 +88,28 @@ class Tracker:
                 f"the MLflow store {uri} cannot be opened ({first_line}); name another --tracking-uri"
             ) from error
 
-    def start(self, config: RunConfig, name: str, method: str) -> None:
-        """Creates the run, with the whole config as params and what a user filters by as tags."""
-        tags = {
-            "method": method,
+    def start(self, config: RunConfig, tags: dict[str, str] | None = None) -> None:
+        """Creates the run, with the whole config as params and, with `tags`, what a user filters by as tags."""
+        known = {
+            "method": config.world.method if config.env.is_swarm else "none",
             "robots": str(config.world.robots),
             "groups": str(config.world.groups),
             "seed": str(config.seed),
             "engine": config.engine,
             "config_hash": config_hash(config),
-            "mlflow.source.git.commit": _git_commit(),
+            "mlflow.source.git.commit": git_commit(),
         }
-        run = self._client.create_run(self._experiment_id, run_name=name, tags=tags)
+        run = self._client.create_run(self._experiment_id, run_name=config.name, tags=known | (tags or {}))
         self.run_id = run.info.run_id
         params = [Param(key, str(value)) for key, value in flat_params(config).items()]
         self._client.log_batch(self.run_id, params=params)
+
+    def find_run(self, tag: str, value: str) -> str | None:
+        """Id of the experiment's oldest run whose `tag` is `value`; None if there is none."""
+        found = self._client.search_runs(
+            [self._experiment_id], f"tags.`{tag}` = '{value}'", max_results=1, order_by=["attributes.start_time ASC"]
+        )
+        return found[0].info.run_id if found else None
 
     def resume(self, run_id: str) -> None:
         """Continues an existing run.
@@ -165,7 +172,7 @@ class Tracker:
         self._client.set_terminated(self.run_id, status)
 
 
-def _git_commit() -> str:
+def git_commit() -> str:
     """The commit of the checkout that this module lies in; `unknown` outside one."""
     here = Path(__file__).parent
     done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False)

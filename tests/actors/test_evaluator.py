@@ -1,14 +1,24 @@
 """Evaluation: one episode a seed, against one environment stepped in a plain loop."""
 
+import dataclasses
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from actors import evaluator
-from actors.evaluator import evaluate, record_episode, record_frames
+from actors.baselines import Baseline
+from actors.calls import LocalCalls
+from actors.evaluator import evaluate, evaluate_in_parts, record_episode, record_frames
 from actors.network import Policy
 from actors.transitions import NO_OUTCOME
+from actors.vector_env import EnvSpec
+from sim_core import ENV_ID
+from sim_core.checks import ConfigError
+from sim_core.config import WorldConfig
 from sim_core.envs import SwarmEnv
+from sim_core.outcomes import Outcome
+from sim_core.worlds import WorldBatch
 
 SEEDS = [2_000_000_000 + i for i in range(7)]
 
@@ -51,6 +61,65 @@ def test_entries_are_in_the_order_of_the_seeds(swarm, make_weights):
     for first, second in zip(evaluate(swarm, weights, SEEDS), backwards, strict=True):
         np.testing.assert_array_equal(first, second[::-1])
     assert [len(column) for column in evaluate(swarm, weights, [])] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 5, 7, 20])
+@pytest.mark.parametrize("name", ["learned", *Baseline])
+def test_parts_give_the_whole_in_the_order_of_the_seeds(swarm, make_weights, name, parts):
+    spec = swarm._replace(world=dataclasses.replace(swarm.world, horizon_steps=100))
+    candidate = make_weights(spec) if name == "learned" else Baseline(name)
+    calls = LocalCalls()
+    seeds = SEEDS[::-1]
+    whole = evaluate(spec, candidate, seeds)
+    joined = evaluate_in_parts(calls, spec, calls.put(candidate), seeds, parts)
+    for first, second in zip(joined, whole, strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert len(set(whole.length_steps)) > 3  # or their order would not show
+
+
+def test_no_seeds_in_parts(swarm):
+    calls = LocalCalls()
+    none = evaluate_in_parts(calls, swarm, calls.put(Baseline.RANDOM), [], 4)
+    assert [len(column) for column in none] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("method", ["sensor", "in", "out"])
+def test_fl_orca_is_the_swarm_without_an_action(method):
+    world = WorldConfig(method=method, robots=4, groups=2, arena_radius_m=2.0, horizon_steps=300)
+    stats = evaluate(EnvSpec(ENV_ID, world), Baseline.FL_ORCA, SEEDS)
+    for i, seed in enumerate(SEEDS):
+        worlds = WorldBatch(world, 1)
+        worlds.seed([seed])
+        worlds.reset()
+        result = worlds.step(None)
+        while result.outcome[0] == Outcome.RUNNING:
+            result = worlds.step(None)
+        assert (stats.outcome[i], stats.length_steps[i]) == (result.outcome[0], result.steps[0])
+        assert stats.episode_return[i] == pytest.approx(result.episode_return[0], rel=1e-6)
+    assert len(set(stats.length_steps)) > 1
+
+
+@pytest.mark.parametrize("baseline", Baseline)
+@pytest.mark.parametrize("chunk", [1, 3])
+def test_a_baseline_does_not_depend_on_how_many_play_at_once(monkeypatch, swarm, baseline, chunk):
+    expected = evaluate(swarm, baseline, SEEDS)
+    monkeypatch.setattr(evaluator, "MAX_ENVS", chunk)
+    for first, second in zip(evaluate(swarm, baseline, SEEDS), expected, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("baseline", Baseline)
+def test_a_recorded_baseline_is_the_evaluated_one(swarm, baseline):
+    stats = evaluate(swarm, baseline, SEEDS)
+    for i, seed in enumerate(SEEDS):
+        episode = record_episode(swarm, baseline, seed)
+        assert (episode.outcome, len(episode.action)) == (stats.outcome[i], stats.length_steps[i] + 1)
+        assert ((episode.action[:-1] == -1) == (baseline is Baseline.FL_ORCA)).all()
+
+
+def test_a_baseline_in_an_environment_that_is_not_ours_is_refused(cart_pole):
+    with pytest.raises(ConfigError, match="random plays in our own environment only, not in CartPole-v1"):
+        evaluate(cart_pole, Baseline.RANDOM, SEEDS)
 
 
 def test_a_recorded_episode_is_the_evaluated_one(swarm, make_weights):

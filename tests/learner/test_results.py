@@ -1,4 +1,4 @@
-"""Rates and means with their intervals, against closed forms and published numbers."""
+"""Summaries of ended episodes and their metrics."""
 
 import math
 
@@ -7,49 +7,9 @@ import pytest
 from scipy import stats
 
 from actors.transitions import NO_OUTCOME, EpisodeStats
-from learner.results import as_metrics, final_metrics, mean, outcome_label, rate, summarise
+from actors.estimates import mean, rate
+from learner.results import as_metrics, final_metrics, outcome_label, summarise
 from sim_core.outcomes import ENDED, Outcome
-
-
-def wilson(count, total):
-    """E. B. Wilson (1927), written out."""
-    z, share = stats.norm.ppf(0.975), count / total
-    centre = (share + z * z / (2 * total)) / (1 + z * z / total)
-    half = z / (1 + z * z / total) * math.sqrt(share * (1 - share) / total + z * z / (4 * total * total))
-    return centre - half, centre + half
-
-
-@pytest.mark.parametrize(("count", "total"), [(0, 1), (1, 1), (0, 20), (20, 20), (3, 7), (81, 263), (997, 1000)])
-def test_rates_have_wilsons_interval(count, total):
-    value, low, high = rate(count, total)
-    assert value == count / total
-    assert (low, high) == pytest.approx(wilson(count, total), abs=1e-12)
-    assert 0 <= low <= value <= high <= 1
-
-
-def test_rates_against_published_numbers():
-    # R. G. Newcombe (1998), Table I, method 3 (score without continuity correction).
-    for count, total, low, high in ((81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0, 0.1611)):
-        assert rate(count, total)[1:] == pytest.approx((low, high), abs=5e-5)
-
-
-def test_no_trials_are_refused():
-    with pytest.raises(ValueError):
-        rate(0, 0)
-
-
-def test_means_have_students_interval():
-    values = np.random.default_rng(0).normal(3, 2, 12)
-    half = stats.t.interval(0.95, 11, loc=values.mean(), scale=values.std(ddof=1) / math.sqrt(12))
-    assert mean(values).value == pytest.approx(values.mean())
-    assert mean(values)[1:] == pytest.approx(half)
-    # Five values by hand: mean 3, s = sqrt(2.5), t(0.975, 4) = 2.776.
-    assert mean(np.arange(1, 6))[1:] == pytest.approx((3 - 2.7764 * 0.70711, 3 + 2.7764 * 0.70711), abs=1e-3)
-
-
-@pytest.mark.parametrize("values", [[2.5], [2.5, 2.5, 2.5]])
-def test_a_mean_without_spread_has_no_width(values):
-    assert mean(np.array(values)) == (2.5, 2.5, 2.5)
 
 
 def episodes(outcomes):

@@ -35,7 +35,7 @@ def store(tmp_path_factory):
 def tracker(store, small_run):
     """A started run."""
     made = Tracker(store[0], "tests", store[1])
-    made.start(small_run, "a run", "sensor")
+    made.start(small_run, {"cell": "one"})
     return made
 
 
@@ -61,7 +61,7 @@ def test_tags_say_what_a_user_filters_by(tracker, small_run, store):
     expected = {"method": "sensor", "robots": "3", "groups": "2", "seed": "3", "engine": "process"}
     assert expected.items() <= tags.items()
     assert tags["config_hash"] == config_hash(small_run) and tags["mlflow.source.git.commit"]
-    assert tags["mlflow.runName"] == "a run" and run_of(tracker).info.status == "RUNNING"
+    assert tags["mlflow.runName"] == "sensor 3r×2g s3" and run_of(tracker).info.status == "RUNNING"
     found = mlflow.MlflowClient(store[0]).search_runs(
         [run_of(tracker).info.experiment_id], "tags.robots = '3' and tags.method = 'sensor' and params.sectors = '4'"
     )

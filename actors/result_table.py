@@ -1,0 +1,96 @@
+"""The results of a sweep as a table: one row a policy and a setup that it was played in.
+
+The table is what a report is made from and what is committed: a CSV file that anyone can read, counts instead of
+rates, a few dozen bytes a row.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple, get_type_hints
+
+from sim_core.checks import ConfigError
+from sim_core.outcomes import ENDED, Outcome
+
+LEARNED = "learned"
+"""`policy` of a trained network; baselines go by their own names."""
+
+
+class ResultRow(NamedTuple):
+    """Counts of one evaluation.
+
+    Fields: preset, and policy (`learned`, or a baseline's name); method whose world it was played in; the setup and
+    seed it was trained with (a baseline's: the setup it was played in, seed 0); the setup it was played in;
+    episodes, and how many ended in each outcome; mean length in env steps; hash of the run's config.
+    """
+
+    preset: str
+    policy: str
+    method: str
+    trained_robots: int
+    trained_groups: int
+    seed: int
+    robots: int
+    groups: int
+    episodes: int
+    goal: int
+    lost: int
+    captured: int
+    collision: int
+    timeout: int
+    mean_length_steps: float
+    config: str
+
+    def count(self, outcome: Outcome) -> int:
+        """Episodes that ended in `outcome`."""
+        return int(getattr(self, outcome.name.lower()))
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether it was played in the setup it was trained in (Fixed), else it is an Extrapolation."""
+        return (self.trained_robots, self.trained_groups) == (self.robots, self.groups)
+
+
+def write_table(path: Path, rows: Iterable[ResultRow]) -> None:
+    """Writes rows in a fixed order to a CSV file; an older one is replaced once the new is whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    with part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(ResultRow._fields)
+        writer.writerows(sorted(rows))
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+
+
+def read_table(path: Path) -> list[ResultRow]:
+    """Reads what `write_table` wrote.
+
+    Raises:
+      ConfigError: the file cannot be read, has other columns, or a row whose counts cannot be.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            lines = list(csv.reader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"the results {path} cannot be read ({error}); name a results.csv of a sweep") from error
+    if not lines or tuple(lines[0]) != ResultRow._fields:
+        raise ConfigError(f"{path} is no table of results: its first line must be {','.join(ResultRow._fields)}")
+    return [_row(line, f"{path}, line {number}") for number, line in enumerate(lines[1:], start=2)]
+
+
+def _row(line: list[str], where: str) -> ResultRow:
+    types: dict[str, Any] = get_type_hints(ResultRow)
+    try:
+        values = [types[name](text) for name, text in zip(ResultRow._fields, line, strict=True)]
+    except ValueError as error:
+        raise ConfigError(f"{where} is no row of results ({error}); make the table again") from error
+    row = ResultRow(*values)
+    counts = [row.count(outcome) for outcome in ENDED]
+    if min(counts) < 0 or sum(counts) != row.episodes or row.episodes < 1:
+        raise ConfigError(f"{where} counts {sum(counts)} outcomes of {row.episodes} episodes; make the table again")
+    return row

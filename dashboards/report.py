@@ -1,0 +1,100 @@
+"""The report on a table of results, as Markdown: what was run, the claims, how presets compare, and the pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from actors.result_table import LEARNED, ResultRow
+from dashboards.claim_checks import Claim
+from dashboards.claim_text import NOTE, table_of, tally, verdict_table
+from dashboards.diagrams import DIAGRAMS
+from dashboards.pooled import METHOD_NAMES, NUM_CELLS, SETUPS, Results, Setup, success
+from dashboards.result_figures import PICTURES
+
+
+class PresetPart(NamedTuple):
+    """What the report says of one preset: its name, results, judged claims, and where its pictures lie."""
+
+    name: str
+    results: Results
+    claims: list[Claim]
+    folder: str
+
+
+def presets_of(rows: Sequence[ResultRow]) -> list[str]:
+    """The presets with a learned policy in the table, by name; `thesis` first, since others are measured against it."""
+    return sorted({row.preset for row in rows if row.policy == LEARNED}, key=lambda name: (name != "thesis", name))
+
+
+def report_markdown(source: str, parts: Sequence[PresetPart]) -> str:
+    """The page.
+
+    Args:
+      source: name of the file with the results.
+      parts: one a preset, in the order in which they are printed.
+    """
+    lines = ["# Results", "", f"Made by `shoal report` from `{source}`.", ""]
+    lines += [*_coverage(parts), ""]
+    if len(parts) > 1:
+        lines += ["## Presets side by side", "", *comparison(parts), ""]
+    lines += [NOTE, "", "Every check with its numbers: [claims.md](claims.md).", ""]
+    for part in parts:
+        lines += _preset_part(part)
+    lines += ["## How it works", ""]
+    for diagram in DIAGRAMS:
+        lines += [f"![{diagram.alt}]({diagram.file})", ""]
+    return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def _coverage(parts: Sequence[PresetPart]) -> list[str]:
+    header = ("preset", f"Fixed cells of {NUM_CELLS}", "Extrapolation cells", "training seeds a cell", "episodes")
+    return table_of(header, [_coverage_row(part) for part in parts])
+
+
+def _coverage_row(part: PresetPart) -> tuple[str, ...]:
+    cells = part.results.cells()
+    seeds = sorted({len(cell.rows) for cell in cells})
+    span = f"{seeds[0]}" if len(seeds) == 1 else f"{seeds[0]} … {seeds[-1]}"
+    fixed = sum(len(part.results.fixed_present(method)) for method in METHOD_NAMES)
+    transferred = sum(not cell.rows[0].is_fixed for cell in cells)
+    episodes = sum(cell.episodes for cell in cells)
+    return part.name, str(fixed), str(transferred), span, f"{episodes:,}"
+
+
+def _preset_part(part: PresetPart) -> list[str]:
+    lines = [f"## Preset {part.name}", "", f"### Claims: {tally(part.claims)}", "", *verdict_table(part.claims), ""]
+    lines += ["### Figures", ""]
+    for picture in PICTURES:
+        lines += [f"![{picture.alt}, preset {part.name}]({part.folder}{picture.file})", ""]
+    return lines
+
+
+def comparison(parts: Sequence[PresetPart]) -> list[str]:
+    """Mean Fixed success of each preset over the setups that all have, a row a method; as lines.
+
+    `better in` counts the setups in which a preset has a higher rate than every other.
+    """
+    names = [part.name for part in parts]
+    header = ["method", "setups in all", *names, *(f"{name} better in" for name in names)]
+    return table_of(header, [_comparison_row(parts, method) for method in METHOD_NAMES])
+
+
+def _comparison_row(parts: Sequence[PresetPart], method: str) -> list[str]:
+    shared = [setup for setup in SETUPS if all(part.results.fixed(method, setup) is not None for part in parts)]
+    if not shared:
+        return [METHOD_NAMES[method], "0", *["–"] * (2 * len(parts))]
+    rates = [[_success(part.results, method, setup) for setup in shared] for part in parts]
+    means = [f"{100 * sum(line) / len(line):.1f} %" for line in rates]
+    wins = [0] * len(parts)
+    for column in zip(*rates, strict=True):
+        best = max(column)
+        if column.count(best) == 1:
+            wins[column.index(best)] += 1
+    return [METHOD_NAMES[method], str(len(shared)), *means, *map(str, wins)]
+
+
+def _success(results: Results, method: str, setup: Setup) -> float:
+    cell = results.fixed(method, setup)
+    assert cell is not None
+    return success(cell).estimate.value

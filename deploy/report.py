@@ -1,0 +1,72 @@
+"""`shoal report`: a table of results becomes figures, judged claims and a page that holds them."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from actors.result_table import read_table
+from dashboards.claim_text import claims_markdown, tally
+from dashboards.claims import judge
+from dashboards.diagrams import DIAGRAMS
+from dashboards.pictures import save_png
+from dashboards.pooled import Results
+from dashboards.report import PresetPart, presets_of, report_markdown
+from dashboards.result_figures import PICTURES
+from sim_core.checks import require
+
+if TYPE_CHECKING:
+    from deploy.options import Report
+
+PRESET_NAME = re.compile(r"\w[\w.-]*")
+"""What a preset may be called: it names a folder where there are several."""
+
+
+def report(command: Report) -> int:
+    """Writes the report of a table; returns the exit code.
+
+    Raises:
+      ConfigError: the table cannot be read, holds no learned policy, or names a preset that no folder can be named.
+    """
+    rows = read_table(command.results)
+    presets = presets_of(rows)
+    require(bool(presets), f"{command.results} holds no results of a learned policy; run a sweep first")
+    parts = []
+    for preset in presets:
+        good = PRESET_NAME.fullmatch(preset) is not None
+        require(good, f"{command.results} names a preset {preset!r}; letters, digits, '.', '_' and '-' can be used")
+        results = Results(row for row in rows if row.preset == preset)
+        folder = f"{preset}/" if len(presets) > 1 else ""
+        parts.append(PresetPart(preset, results, judge(results), folder))
+    _write(command.out, command.results.name, parts)
+    for part in parts:
+        Console().print(f"{part.name}: {tally(part.claims)}", highlight=False)
+    Console().print(str(command.out / "report.md"), highlight=False, soft_wrap=True)
+    return 0
+
+
+def _write(out: Path, source: str, parts: list[PresetPart]) -> None:
+    """All files; the page comes last, so that it never embeds what is not there."""
+    for part in parts:
+        folder = out / part.folder
+        folder.mkdir(parents=True, exist_ok=True)
+        for picture in PICTURES:
+            save_png(picture.draw(part.results), folder / picture.file)
+    for diagram in DIAGRAMS:
+        save_png(diagram.draw(), out / diagram.file)
+    _write_text(out / "claims.md", claims_markdown({part.name: part.claims for part in parts}))
+    _write_text(out / "report.md", report_markdown(source, parts))
+
+
+def _write_text(path: Path, text: str) -> None:
+    """Writes a file; an older one is replaced once the new is whole."""
+    part = path.with_name(path.name + ".part")
+    with part.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)

@@ -1,0 +1,157 @@
+"""A sweep: robots x groups x method x seed as cells, each one training and its evaluations. Pure; runs nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+from actors.result_table import LEARNED, ResultRow
+from learner.config import RunConfig, to_dict
+from learner.presets import PresetName, preset_config
+from sim_core.checks import check_fields, require
+from sim_core.config import WorldConfig
+
+MethodName = Literal["sensor", "in", "out"]
+ROBOTS = (5, 10, 15, 20, 25)
+"""Robots per group of the dissertation's setups (3.3)."""
+GROUPS = (1, 2, 3, 4, 8)
+"""Group counts of the dissertation's setups (3.3)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepConfig:
+    """Which cells a sweep has and how they are evaluated.
+
+    Raises:
+      ConfigError: a value is out of range.
+    """
+
+    preset: PresetName = "thesis"
+    """Settings of every training: the text's reading, or our best."""
+    methods: tuple[MethodName, ...] = ("sensor", "in", "out")
+    """State representations."""
+    robots: tuple[int, ...] = ROBOTS
+    """Robots per group."""
+    groups: tuple[int, ...] = GROUPS
+    """Group counts."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Training seeds; all cells of the first one are trained before those of the next."""
+    env_steps: int | None = None
+    """Env steps of each training; the preset's by default. Rates that fall over the training fall over these."""
+    episodes: int = 3_000
+    """Fixed: greedy episodes in the setup of the training (3.3: 30 iterations of 100)."""
+    extrapolation: Literal["all", "none"] = "all"
+    """Extrapolation: every policy in every other setup that it fits (M_IN, M_OUT: of as many groups), or none."""
+    extrapolation_episodes: int = 500
+    """Extrapolation: greedy episodes in each other setup."""
+    first_seed: int = 2_000_000_000
+    """Seed of the first evaluated episode; the others count on. Calibration uses others than the evaluation."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        for name in ("methods", "robots", "groups", "seeds"):
+            values = getattr(self, name)
+            require(isinstance(values, tuple) and len(values) > 0, f"{name} must have at least one value")
+            require(len(set(values)) == len(values), f"{name} must not repeat a value, as in {values}")
+        known = get_args(MethodName)
+        require(set(self.methods) <= set(known), f"methods must be among {', '.join(known)}, not {self.methods}")
+        for name in ("episodes", "extrapolation_episodes", "env_steps"):
+            value = getattr(self, name)
+            require(value is None or value >= 1, f"{name} must be at least 1, not {value}")
+        most = 2**32 - 1 - max(self.episodes, self.extrapolation_episodes)
+        require(0 <= self.first_seed <= most, f"first_seed must be in 0..{most}, not {self.first_seed}")
+
+
+class Cell(NamedTuple):
+    """One training of a sweep; `key` tells configs apart and names its folder."""
+
+    key: str
+    config: RunConfig
+
+    @property
+    def weight(self) -> float:
+        """What the cell costs, roughly: env steps x (robots and a part for perception and learning)."""
+        return self.config.total_env_steps * (self.config.world.num_robots + 60.0)
+
+
+def cell_hash(config: RunConfig) -> str:
+    """Twelve hex digits of all that decides a cell's results; unlike `config_hash`, the training's length counts."""
+    values = to_dict(config)
+    values.pop("engine")
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def make_cell(sweep: SweepConfig, method: MethodName, robots: int, groups: int, seed: int) -> Cell:
+    """The cell of one method, setup and seed.
+
+    Raises:
+      ConfigError: the setup is not possible.
+    """
+    preset = preset_config(sweep.preset, method, robots, groups)
+    env_steps = sweep.env_steps or preset.total_env_steps
+    config = dataclasses.replace(
+        preset,
+        total_env_steps=env_steps,
+        learning_rate_decay_env_steps=env_steps,
+        seed=seed,
+        engine="process",
+        final_eval_episodes=sweep.episodes,
+        final_eval_first_seed=sweep.first_seed,
+    )
+    return Cell(f"{method}-{robots}r{groups}g-s{seed}-{cell_hash(config)}", config)
+
+
+def make_cells(sweep: SweepConfig) -> list[Cell]:
+    """All cells: seed after seed, within a seed the costliest first, so that cores end together.
+
+    Raises:
+      ConfigError: a setup is not possible.
+    """
+    cells: list[Cell] = []
+    for seed in sweep.seeds:
+        of_seed = [
+            make_cell(sweep, method, robots, groups, seed)
+            for method in sweep.methods
+            for robots in sweep.robots
+            for groups in sweep.groups
+        ]
+        cells += sorted(of_seed, key=lambda cell: -cell.weight)
+    return cells
+
+
+def tested_worlds(sweep: SweepConfig, cell: Cell) -> list[WorldConfig]:
+    """The other setups in which a cell's policy is evaluated (Extrapolation).
+
+    M_sensor's state has the same size in all; that of M_IN and M_OUT has a row a group, so groups stay.
+    """
+    world = cell.config.world
+    if sweep.extrapolation == "none":
+        return []
+    groups = sweep.groups if world.method == "sensor" else (world.groups,)
+    setups = [(r, g) for r in sweep.robots for g in groups if (r, g) != (world.robots, world.groups)]
+    return [dataclasses.replace(world, robots=r, groups=g) for r, g in setups]
+
+
+def wanted(sweep: SweepConfig, cell: Cell) -> dict[tuple[int, int], int]:
+    """Episodes that a cell's results must have, by (robots, groups) played in."""
+    world = cell.config.world
+    others = {(w.robots, w.groups): sweep.extrapolation_episodes for w in tested_worlds(sweep, cell)}
+    return {(world.robots, world.groups): sweep.episodes} | others
+
+
+def done_cells(sweep: SweepConfig, cells: Iterable[Cell], rows: Iterable[ResultRow]) -> dict[str, list[ResultRow]]:
+    """The results of every cell, by key, that `rows` hold in full; a cell of which they hold a part is left out."""
+    by_config: dict[str, dict[tuple[int, int], ResultRow]] = {}
+    for row in rows:
+        if row.policy == LEARNED and row.preset == sweep.preset:
+            by_config.setdefault(row.config, {})[row.robots, row.groups] = row
+    done = {}
+    for cell in cells:
+        found, need = by_config.get(cell_hash(cell.config), {}), wanted(sweep, cell)
+        if all(setup in found and found[setup].episodes >= count for setup, count in need.items()):
+            done[cell.key] = [found[setup] for setup in need]
+    return done

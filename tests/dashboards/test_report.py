@@ -1,0 +1,65 @@
+"""The report's page: what it says was run, and how it compares presets."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from actors.result_table import ResultRow
+from dashboards.claims import judge
+from dashboards.diagrams import DIAGRAMS
+from dashboards.pooled import Results, Setup
+from dashboards.report import PresetPart, comparison, presets_of, report_markdown
+from dashboards.result_figures import PICTURES
+from tests.dashboards.tables import claimed_table, fixed, row
+
+
+def part(name: str, rows: Sequence[ResultRow], folder: str = "") -> PresetPart:
+    results = Results(rows)
+    return PresetPart(name, results, judge(results), folder)
+
+
+def test_presets_are_those_with_a_policy_and_thesis_comes_first():
+    rows = [row("sensor", Setup(5, 1), success=50, preset=name) for name in ("best", "thesis", "arena")]
+    rows.append(row("sensor", Setup(5, 1), success=50, preset="baselines")._replace(policy="orca"))
+    assert presets_of(rows) == ["thesis", "arena", "best"]
+
+
+def test_page_says_what_was_run():
+    rows = [*claimed_table(), fixed("sensor", Setup(5, 1))._replace(seed=1, episodes=3000)]
+    page = report_markdown("results.csv", [part("thesis", rows)])
+    assert "`results.csv`" in page and "Presets side by side" not in page
+    assert "| thesis | 75 | 10 | 1 … 2 | 258,000 |" in page
+
+
+def test_partial_tables_are_counted():
+    page = report_markdown("half.csv", [part("best", [fixed("out", Setup(5, 1)), fixed("in", Setup(5, 1))])])
+    assert "| best | 2 | 0 | 1 | 6,000 |" in page and "15 no data" in page
+
+
+def test_page_embeds_every_picture_with_words_for_it():
+    parts = [part("thesis", claimed_table(), "thesis/"), part("best", claimed_table(), "best/")]
+    links = re.findall(r"!\[([^\]]+)\]\(([^)]+)\)", report_markdown("r.csv", parts))
+    wanted = [f"{name}/{picture.file}" for name in ("thesis", "best") for picture in PICTURES]
+    assert [link for _, link in links] == wanted + [diagram.file for diagram in DIAGRAMS]
+    assert len({words for words, _ in links}) == len(links)
+
+
+def test_presets_are_compared_where_all_have_a_cell():
+    small, middle, large = Setup(5, 1), Setup(10, 2), Setup(25, 8)
+    first = [row("sensor", setup, success=share) for setup, share in ((small, 90), (middle, 80), (large, 10))]
+    first.append(row("out", small, success=70))
+    second = [row("sensor", setup, success=share) for setup, share in ((small, 95), (middle, 60))]
+    second.append(row("in", small, success=70))
+    lines = comparison([part("thesis", first), part("best", second)])
+    assert lines[0] == "| method | setups in all | thesis | best | thesis better in | best better in |"
+    assert lines[2:] == [
+        "| M_sensor | 2 | 85.0 % | 77.5 % | 1 | 1 |",
+        "| M_IN | 0 | – | – | – | – |",
+        "| M_OUT | 0 | – | – | – | – |",
+    ]
+
+
+def test_a_tie_is_nobodys():
+    rows = [row("out", Setup(5, 1), success=70)]
+    assert "| M_OUT | 1 | 70.0 % | 70.0 % | 0 | 0 |" in comparison([part("a", rows), part("b", rows)])

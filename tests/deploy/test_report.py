@@ -1,0 +1,83 @@
+"""`shoal report` from a file to its folder."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from actors.result_table import ResultRow, write_table
+from dashboards.diagrams import DIAGRAMS
+from dashboards.pooled import Setup
+from dashboards.result_figures import PICTURES
+from deploy.options import Report
+from deploy.report import report
+from sim_core.checks import ConfigError
+from tests.dashboards.tables import claimed_table, row
+
+COMMON = {"claims.md", "report.md", *(diagram.file for diagram in DIAGRAMS)}
+
+
+def made(rows: list[ResultRow], folder: Path, name: str = "out") -> dict[str, bytes]:
+    """The files of a report on `rows`, by their path in its folder."""
+    write_table(folder / "results.csv", rows)
+    assert report(Report(results=folder / "results.csv", out=folder / name)) == 0
+    paths = [path for path in (folder / name).rglob("*") if path.is_file()]
+    return {path.relative_to(folder / name).as_posix(): path.read_bytes() for path in paths}
+
+
+BOTH = [
+    *claimed_table(),
+    row("sensor", Setup(5, 1), success=80, preset="best"),
+    row("out", Setup(10, 2), success=90, preset="best"),
+]
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files of a report on two presets."""
+    return made(BOTH, tmp_path_factory.mktemp("both"))
+
+
+def test_one_preset_needs_no_folder_and_replaces_an_older_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "claims.md").write_text("old")
+    files = made(claimed_table(), tmp_path)
+    assert set(files) == COMMON | {picture.file for picture in PICTURES}
+    page = files["claims.md"].decode()
+    assert page.startswith("# The dissertation's claims") and "15 holds" in page
+    assert "thesis: 15 holds" in capsys.readouterr().out
+
+
+def test_presets_have_a_folder_each_and_every_link_leads_somewhere(both: dict[str, bytes]):
+    assert set(both) == COMMON | {f"{name}/{picture.file}" for name in ("thesis", "best") for picture in PICTURES}
+    page = both["report.md"].decode()
+    assert set(re.findall(r"\]\(([^)]+)\)", page)) == set(both) - {"report.md"}
+    assert "| M_sensor | 1 | 94.0 % | 80.0 % | 1 | 0 |" in page
+    assert both["claims.md"].decode().count("## Preset ") == 2
+    assert both["thesis/heatmap.png"] != both["best/heatmap.png"]
+
+
+def test_the_same_results_give_the_same_bytes(both: dict[str, bytes], tmp_path: Path):
+    assert made(BOTH[::-1], tmp_path, "elsewhere") == both
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([], "no results of a learned policy"),
+        ([row("sensor", Setup(5, 1), success=50)._replace(policy="orca")], "no results of a learned policy"),
+        ([row("sensor", Setup(5, 1), success=50, preset="../elsewhere")], "names a preset '../elsewhere'"),
+    ],
+)
+def test_refuses_what_cannot_be_reported(rows: list[ResultRow], message: str, tmp_path: Path):
+    write_table(tmp_path / "results.csv", rows)
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        report(Report(results=tmp_path / "results.csv", out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_refuses_a_file_that_is_not_there(tmp_path: Path):
+    with pytest.raises(ConfigError, match="cannot be read"):
+        report(Report(results=tmp_path / "none.csv", out=tmp_path / "out"))

@@ -1,0 +1,183 @@
+"""`shoal evaluate`: baselines and policies, what is stored, and what is refused before anything is played."""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file
+
+from actors.baselines import Baseline
+from actors.evaluation_store import load_evaluation
+from actors.evaluator import evaluate
+from actors.network import QNetwork, snapshot
+from actors.trajectory import load_episodes
+from actors.vector_env import EnvSpec, env_shape
+from deploy import playing
+from deploy.cli import main
+from deploy.playing import episodes_path
+from learner.policy_file import save_policy
+from learner.run_folder import RunFolder
+from sim_core import ENV_ID
+from sim_core.config import WorldConfig
+from tests.integration.conftest import SMALL
+
+FIRST_SEED = 2_000_000_000
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """An empty folder to work in, where evaluation needs no Ray."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(playing, "evaluate_in_tasks", lambda spec, player, seeds, _: evaluate(spec, player, seeds))
+    return tmp_path
+
+
+def make_run(name="r", **changes):
+    """A run folder under runs/ that holds a policy and no checkpoint, as a sweep leaves it."""
+    config = dataclasses.replace(SMALL, **changes)
+    run = RunFolder(Path("runs") / name)
+    run.save_config(config)
+    shape = env_shape(config.env)
+    torch.manual_seed(0)
+    network = QNetwork(shape.observation_size, config.hidden_sizes, shape.num_actions)
+    save_policy(run.policy, snapshot(network, 77, 0.0), config, shape)
+    return run, config, snapshot(network, 77, 0.0)
+
+
+def assert_same_stats(stored, expected):
+    for first, second in zip(stored, expected, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("baseline", Baseline)
+@pytest.mark.parametrize("method", ["sensor", "in", "out"])
+def test_a_baseline_is_stored_as_it_was_played(capsys, folder, baseline, method):
+    arguments = ["--method", method, "--robots", "4", "--groups", "1", "--episodes", "5", "--out", "new/e.zarr"]
+    assert main(["evaluate", str(baseline), *arguments]) == 0
+    printed = capsys.readouterr().out
+    assert f"{baseline}, {method} 4r×1g: 5 episodes" in printed
+    assert "success rate" in printed and "new/e.zarr" in printed
+    stored = load_evaluation(folder / "new" / "e.zarr")
+    spec = EnvSpec(ENV_ID, WorldConfig(method=method, robots=4, groups=1))
+    seeds = list(range(FIRST_SEED, FIRST_SEED + 5))
+    assert (stored.spec, stored.player, stored.updates) == (spec, str(baseline), 0)
+    assert stored.seed.tolist() == seeds
+    assert_same_stats(stored.stats, evaluate(spec, baseline, seeds))
+
+
+def test_a_baseline_plays_the_dissertations_setup_by_default(capsys):
+    assert main(["evaluate", "random", "--episodes", "2"]) == 0
+    assert "random, sensor 10r×2g: 2 episodes" in capsys.readouterr().out
+
+
+def test_a_policy_is_stored_as_it_was_played_on_another_setup(capsys, folder):
+    _, config, weights = make_run()
+    arguments = ["--robots", "4", "--episodes", "5", "--first-seed", "9", "--out", "e.zarr"]
+    assert main(["evaluate", "r", *arguments]) == 0
+    assert "sensor 4r×2g: 5 greedy episodes" in capsys.readouterr().out
+    stored = load_evaluation(folder / "e.zarr")
+    spec = config.env._replace(world=dataclasses.replace(config.world, robots=4))
+    assert (stored.spec, stored.player, stored.updates) == (spec, "r", 77)
+    assert_same_stats(stored.stats, evaluate(spec, weights, list(range(9, 14))))
+
+
+@pytest.mark.parametrize("player", ["r", *Baseline])
+def test_the_first_episodes_are_recorded_whole(folder, player):
+    make_run()
+    assert main(["evaluate", player, "--robots", "3", "--episodes", "4", "--record", "2", "--out", "e.zarr"]) == 0
+    stored = load_evaluation(folder / "e.zarr")
+    episodes, world = load_episodes(folder / "e-episodes.zarr")
+    assert world == stored.spec.world
+    assert [episode.seed for episode in episodes] == [FIRST_SEED, FIRST_SEED + 1]
+    assert [episode.outcome for episode in episodes] == stored.stats.outcome[:2].tolist()
+    assert [len(episode.action) - 1 for episode in episodes] == stored.stats.length_steps[:2].tolist()
+
+
+def test_a_baselines_name_is_taken_and_a_run_of_that_name_is_named_as_a_folder(capsys):
+    make_run("greedy")
+    assert main(["evaluate", "greedy", "--episodes", "2"]) == 0
+    assert "greedy, sensor 10r×2g: 2 episodes" in capsys.readouterr().out
+    assert main(["evaluate", "./greedy", "--episodes", "2"]) == 0
+    assert "sensor 3r×2g: 2 greedy episodes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["r", "--method", "in"], ["--method", "fl-orca, greedy, random", "'r' has a method of its own"]),
+        (["greedy", "--method", "touch"], ["--method", "touch"]),
+        (["greedy", "--robots", "1"], ["robots", "at least 2"]),
+        (["fl-orca", "--robots", "400"], ["does not fit"]),
+        (["random", "--method", "out", "--robots", "2"], ["robots", "at least 3"]),
+        (["greedy", "--episodes", "0"], ["--episodes", "at least 1"]),
+        (["greedy", "--first-seed", "-1"], ["--first-seed"]),
+        (["greedy", "--record", "1"], ["--record needs --out"]),
+        (["greedy", "--record", "-1", "--out", "e.zarr"], ["--record", "0..1000"]),
+        (["greedy", "--record", "3", "--episodes", "2", "--out", "e.zarr"], ["--record", "0..2", "3"]),
+        (["greedy", "--out", "e.csv"], ["--out", ".zarr", "e.csv"]),
+        (["greedy", "--out", ""], ["--out", ".zarr"]),
+        (["greedy", "--out", "/proc/nothing/e.zarr"], ["--out", "/proc/nothing/e.zarr", "write"]),
+        (["greedy", "--out", "taken.zarr"], ["taken.zarr exists", "not overwritten"]),
+        (["greedy", "--out", "half.zarr", "--record", "1"], ["half-episodes.zarr exists", "not overwritten"]),
+        (["nobody"], ["nobody", "runs there: c, r"]),
+        (["c", "--groups", "3"], ["--groups", "CartPole-v1"]),
+        (["c", "--out", "e.zarr", "--record", "1"], ["--record", "CartPole-v1"]),
+    ],
+)
+def test_refused_before_anything_is_played(capsys, folder, monkeypatch, arguments, words):
+    def played(*_):
+        raise AssertionError("an episode was played")
+
+    make_run()
+    make_run("c", env_id="CartPole-v1")
+    (folder / "taken.zarr").mkdir()
+    (folder / "half-episodes.zarr").mkdir()
+    monkeypatch.setattr(playing, "evaluate_in_tasks", played)
+    try:
+        code = main(["evaluate", *arguments])
+    except SystemExit as stop:  # tyro's way out
+        code = stop.code
+    error = capsys.readouterr().err
+    assert code == 2
+    assert "Traceback" not in error
+    for word in words:
+        assert word in error
+    assert sorted(path.name for path in folder.iterdir()) == ["half-episodes.zarr", "runs", "taken.zarr"]
+
+
+def test_without_record_older_episodes_are_no_obstacle(folder):
+    (folder / "e-episodes.zarr").mkdir()
+    assert main(["evaluate", "greedy", "--episodes", "2", "--out", "e.zarr"]) == 0
+
+
+def test_an_environment_that_is_not_ours_is_stored_too(folder):
+    _, config, weights = make_run("c", env_id="CartPole-v1")
+    assert main(["evaluate", "c", "--episodes", "3", "--out", "e.zarr"]) == 0
+    stored = load_evaluation(folder / "e.zarr")
+    assert stored.spec.env_id == "CartPole-v1"
+    assert_same_stats(stored.stats, evaluate(config.env, weights, list(range(FIRST_SEED, FIRST_SEED + 3))))
+
+
+def test_a_damaged_policy_is_refused(capsys):
+    run, _, _ = make_run()
+    assert load_file(run.policy)
+    os.truncate(run.policy, 100)
+    assert main(["evaluate", "r"]) == 2
+    assert "policy.safetensors" in capsys.readouterr().err
+
+
+def test_episodes_lie_beside_the_results():
+    assert episodes_path(Path("a/b.c.zarr")) == Path("a/b.c-episodes.zarr")
+
+
+@pytest.mark.ray
+def test_over_ray_the_results_are_those_of_one_process(shoal, folder):
+    done = shoal("evaluate", "random", "--robots", "4", "--episodes", "7", "--out", "e.zarr")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    stored = load_evaluation(folder / "e.zarr")
+    assert stored.seed.tolist() == list(range(FIRST_SEED, FIRST_SEED + 7))
+    assert_same_stats(stored.stats, evaluate(stored.spec, Baseline.RANDOM, stored.seed.tolist()))
