@@ -11,11 +11,10 @@ from typing import Literal, NamedTuple, get_args
 
 from actors.result_table import LEARNED, ResultRow
 from learner.config import RunConfig, to_dict
-from learner.presets import PresetName, preset_config
+from learner.presets import MethodName, PresetName, preset_config
 from sim_core.checks import check_fields, require
 from sim_core.config import WorldConfig
 
-MethodName = Literal["sensor", "in", "out"]
 ROBOTS = (5, 10, 15, 20, 25)
 """Robots per group of the dissertation's setups (3.3)."""
 GROUPS = (1, 2, 3, 4, 8)
@@ -123,7 +122,7 @@ def make_cells(sweep: SweepConfig) -> list[Cell]:
     return cells
 
 
-def tested_worlds(sweep: SweepConfig, cell: Cell) -> list[WorldConfig]:
+def other_worlds(sweep: SweepConfig, cell: Cell) -> list[WorldConfig]:
     """The other setups in which a cell's policy is evaluated (Extrapolation).
 
     M_sensor's state has the same size in all; that of M_IN and M_OUT has a row a group, so groups stay.
@@ -139,7 +138,7 @@ def tested_worlds(sweep: SweepConfig, cell: Cell) -> list[WorldConfig]:
 def wanted(sweep: SweepConfig, cell: Cell) -> dict[tuple[int, int], int]:
     """Episodes that a cell's results must have, by (robots, groups) played in."""
     world = cell.config.world
-    others = {(w.robots, w.groups): sweep.extrapolation_episodes for w in tested_worlds(sweep, cell)}
+    others = {(w.robots, w.groups): sweep.extrapolation_episodes for w in other_worlds(sweep, cell)}
     return {(world.robots, world.groups): sweep.episodes} | others
 
 

@@ -26,7 +26,7 @@ from learner.journal import Row
 from learner.policy_file import save_policy
 from learner.run import RunResult, execute, resume_point
 from learner.run_folder import RunFolder, RunIdentity
-from learner.sweep import Cell, SweepConfig, cell_hash, tested_worlds
+from learner.sweep import Cell, SweepConfig, cell_hash, other_worlds
 from learner.tracker import Tracker
 from sim_core.config import WorldConfig
 from sim_core.outcomes import ENDED
@@ -144,7 +144,7 @@ def _evaluate_all(
     config = cell.config
     results = [_stored(sweep, config, config, fixed, folder, weights.version)]
     seeds = list(range(sweep.first_seed, sweep.first_seed + sweep.extrapolation_episodes))
-    for world in tested_worlds(sweep, cell):
+    for world in other_worlds(sweep, cell):
         played = dataclasses.replace(config, world=world)
         results.append(_stored(sweep, played, config, evaluate(played.env, weights, seeds), folder, weights.version))
     return results

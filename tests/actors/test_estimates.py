@@ -51,7 +51,8 @@ def test_a_mean_without_spread_has_no_width(values):
 
 
 def test_differences_against_published_numbers():
-    # R. G. Newcombe (1998), "Interval estimation for the difference between independent proportions", Table II, method 10.
+    # R. G. Newcombe (1998), "Interval estimation for the difference between independent proportions", Table II,
+    # method 10.
     for first, second, low, high in (
         ((56, 70), (48, 80), 0.0524, 0.3339),
         ((9, 10), (3, 10), 0.1705, 0.8090),

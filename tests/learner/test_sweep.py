@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from actors.result_table import ResultRow
-from learner.sweep import SweepConfig, cell_hash, done_cells, make_cell, make_cells, tested_worlds, wanted
+from learner.sweep import SweepConfig, cell_hash, done_cells, make_cell, make_cells, other_worlds, wanted
 from sim_core.checks import ConfigError
 
 SMALL = SweepConfig(robots=(5, 10), groups=(1, 2), seeds=(0,), episodes=30, extrapolation_episodes=20)
@@ -50,14 +50,14 @@ def test_the_dissertations_grid_has_75_setups_a_seed():
 
 def test_a_policy_is_tested_wherever_its_state_fits():
     sweep = SweepConfig()
-    sensor = tested_worlds(sweep, make_cell(sweep, "sensor", 10, 2, 0))
+    sensor = other_worlds(sweep, make_cell(sweep, "sensor", 10, 2, 0))
     assert len({(world.robots, world.groups) for world in sensor}) == 24
     assert (10, 2) not in {(world.robots, world.groups) for world in sensor}
     for method in ("in", "out"):
-        others = tested_worlds(sweep, make_cell(sweep, method, 10, 2, 0))
+        others = other_worlds(sweep, make_cell(sweep, method, 10, 2, 0))
         assert {(world.robots, world.groups) for world in others} == {(r, 2) for r in (5, 15, 20, 25)}
         assert {world.method for world in others} == {method}
-    assert tested_worlds(SweepConfig(extrapolation="none"), make_cell(sweep, "sensor", 10, 2, 0)) == []
+    assert other_worlds(SweepConfig(extrapolation="none"), make_cell(sweep, "sensor", 10, 2, 0)) == []
 
 
 def test_a_cells_key_tells_apart_all_that_decides_its_results():

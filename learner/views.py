@@ -1,0 +1,111 @@
+"""Views that are there when a sweep's experiment opens in the MLflow UI: the grid, by method, failures.
+
+The UI keeps a shared view as a compressed tag of the experiment. That format is MLflow's own and may change with its
+version, so views are a courtesy: whoever sets them goes on without where the store does not take them.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from typing import Any
+
+TAG = "mlflow.sharedViewState."
+SETUP_PARAMS = ("method", "robots", "groups")
+FAILURES = ("lost", "captured", "collision", "timeout")
+
+
+def _chart(kind: str, section: str, name: str, **settings: Any) -> dict[str, Any]:
+    base = {"runsCountToCompare": 100, "deleted": False, "isGenerated": False, "displayName": name}
+    return {"uuid": f"{section}-{name}", "type": kind, "metricSectionId": section, **base, **settings}
+
+
+def _bar(section: str, metric: str) -> dict[str, Any]:
+    return _chart("BAR", section, metric, metricKey=metric)
+
+
+def _line(section: str, metric: str) -> dict[str, Any]:
+    axes = {"xAxisKey": "step", "selectedXAxisMetricKey": "", "xAxisScaleType": "linear", "scaleType": "linear"}
+    values = {"yAxisKey": "metric", "yAxisExpressions": [], "range": {}, "lineSmoothness": 0, "ignoreOutliers": False}
+    ours = {"useGlobalXaxisKey": True, "useGlobalLineSmoothing": True}
+    return _chart("LINE", section, metric, metricKey=metric, selectedMetricKeys=[metric], **axes, **values, **ours)
+
+
+def _section(uuid: str, name: str) -> dict[str, Any]:
+    return {
+        "uuid": uuid,
+        "name": name,
+        "display": True,
+        "isReordered": True,
+        "deleted": False,
+        "isGenerated": False,
+    }
+
+
+def _state(charts: dict[str, list[dict[str, Any]]], group_by: str | None = None) -> dict[str, Any]:
+    """What the UI stores of a view: `charts` by the name of their section."""
+    keys = [{"mode": "param", "groupByData": group_by}]
+    metrics = ["final/success_rate", *(f"final/{failure}_rate" for failure in FAILURES)]
+    return {
+        "searchFilter": "",
+        "orderByKey": "metrics.`final/success_rate`",
+        "orderByAsc": False,
+        "startTime": "ALL",
+        "lifecycleFilter": "Active",
+        "datasetsFilter": [],
+        "modelVersionFilter": "All Runs",
+        "selectedColumns": [f"params.`{p}`" for p in (*SETUP_PARAMS, "seed")] + [f"metrics.`{m}`" for m in metrics],
+        "columnOrder": [],
+        "columnWidths": {},
+        "runsHiddenMode": "SHOWALL",
+        "viewMaximized": False,
+        "runListHidden": False,
+        "isAccordionReordered": True,
+        "useGroupedValuesInCharts": True,
+        "hideEmptyCharts": True,
+        "groupBy": {"aggregateFunction": "average", "groupByKeys": keys} if group_by else None,
+        "groupsExpanded": {},
+        "globalLineChartConfig": {"xAxisKey": "step", "lineSmoothness": 0, "selectedXAxisMetricKey": ""},
+        "compareRunSections": [_section(name.lower(), name) for name in charts],
+        "compareRunCharts": [chart for several in charts.values() for chart in several],
+    }
+
+
+def sweep_views() -> dict[str, tuple[str, dict[str, Any]]]:
+    """The views of a sweep's experiment: by key, the name that the UI shows and the state."""
+
+    def param(key: str) -> dict[str, str]:
+        return {"key": key, "type": "PARAM"}
+
+    success = {"key": "final/success_rate", "type": "METRIC"}
+    grid = [
+        _chart(
+            "PARALLEL",
+            "grid",
+            "method × robots × groups",
+            selectedParams=list(SETUP_PARAMS),
+            selectedMetrics=["final/success_rate"],
+            showAllRuns=True,
+        ),
+        _chart("CONTOUR", "grid", "success", xaxis=param("robots"), yaxis=param("groups"), zaxis=success),
+        _bar("grid", "final/success_rate"),
+    ]
+    curves = [_line("curves", "eval/success_rate"), _line("curves", "train/success_rate")]
+    failures = [_bar("failures", f"final/{failure}_rate") for failure in FAILURES]
+    by = {
+        name: _state({"Grid": [_bar("grid", "final/success_rate")], "Failures": failures, "Curves": curves}, name)
+        for name in ("method", "robots", "groups")
+    }
+    return {
+        "grid": ("1 Grid", _state({"Grid": grid, "Curves": curves})),
+        "by-method": ("2 By method", by["method"]),
+        "by-robots": ("3 By robots", by["robots"]),
+        "by-groups": ("4 By groups", by["groups"]),
+    }
+
+
+def packed_view(name: str, state: dict[str, Any], time_ms: int) -> str:
+    """The tag's value as the UI reads it."""
+    packed = base64.b64encode(zlib.compress(json.dumps(state).encode())).decode()
+    return json.dumps({"name": name, "createdAt": time_ms, "updatedAt": time_ms, "state": f"deflate;{packed}"})

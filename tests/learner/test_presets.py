@@ -1,0 +1,31 @@
+"""The presets: possible in every setup, and what the text says of `thesis`."""
+
+import pytest
+
+from learner.presets import preset_config
+from learner.sweep import GROUPS, ROBOTS
+
+
+@pytest.mark.parametrize("name", ["thesis", "best"])
+@pytest.mark.parametrize("method", ["sensor", "in", "out"])
+def test_every_setup_of_the_dissertation_is_possible(name, method):
+    for robots in ROBOTS:
+        for groups in GROUPS:
+            config = preset_config(name, method, robots, groups)
+            assert (config.world.method, config.world.robots, config.world.groups) == (method, robots, groups)
+
+
+@pytest.mark.parametrize("method", ["sensor", "in", "out"])
+def test_thesis_has_the_numbers_of_tables_3_2_and_4_2(method):
+    config = preset_config("thesis", method, 10, 2)
+    world = config.world
+    assert config.learning_rate == 0.001 and config.epsilon_end == 0.05
+    assert (world.horizon_steps, world.learner_speed_m_s, world.reward_scale) == (500, 1.0, 1.0)
+    assert (world.inner_radius_m, world.outer_radius_m) == (0.5, 1.5)
+    assert world.ellipse_chi_square == 5.991 and world.apf_range_m == world.inner_radius_m
+    assert world.swarm_knows_learner == "method" and config.algorithm == "double_dqn"
+
+
+def test_the_presets_differ():
+    for method in ("sensor", "in", "out"):
+        assert preset_config("thesis", method, 10, 2) != preset_config("best", method, 10, 2)

@@ -1,0 +1,126 @@
+"""One cell of a sweep: its results are those of its episodes, and no crash changes or doubles them."""
+
+import dataclasses
+import shutil
+
+import mlflow
+import numpy as np
+import pytest
+
+from actors.evaluation_store import load_evaluation
+from actors.evaluator import evaluate
+from actors.result_table import read_table
+from actors.vector_env import env_shape
+from learner.policy_file import read_saved_policy
+from learner.run_folder import RunFolder
+from learner.sweep import Cell, SweepConfig, cell_hash
+from learner.tracker import Tracker
+from learner.trial import SweepPlace, run_cell
+from sim_core.outcomes import ENDED, Outcome
+
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy is deprecated")
+
+SWEEP = SweepConfig(robots=(3, 4), groups=(1, 2), seeds=(3,), episodes=40, extrapolation_episodes=10, first_seed=77)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mlflow")
+    uri = f"sqlite:///{folder / 'mlflow.db'}"
+    Tracker(uri, "cells", str(folder / "artifacts"))
+    yield uri
+    mlflow.set_tracking_uri(None)
+
+
+@pytest.fixture
+def cell(small_run):
+    config = dataclasses.replace(
+        small_run,
+        total_env_steps=4_000,
+        eval_every_env_steps=1_000,
+        eval_episodes=4,
+        log_every_env_steps=500,
+        checkpoint_every_env_steps=1_000,
+        final_eval_episodes=SWEEP.episodes,
+        final_eval_first_seed=SWEEP.first_seed,
+    )
+    return Cell(f"cell-{cell_hash(config)}", config)
+
+
+def runs_of(uri, cell):
+    client = mlflow.MlflowClient(uri)
+    experiment = client.get_experiment_by_name("cells").experiment_id
+    return client, client.search_runs([experiment], f"tags.cell = '{cell.key}'")
+
+
+class Crash(Exception):
+    pass
+
+
+def crashing_at(env_steps):
+    def on_row(row):
+        if row.env_steps >= env_steps:
+            raise Crash
+
+    return on_row
+
+
+def test_a_cells_table_counts_its_stored_episodes(store, cell, tmp_path):
+    place = SweepPlace(tmp_path, store, "cells")
+    rows = read_table(run_cell(SWEEP, cell, place, lambda row: None))
+    assert {(row.robots, row.groups): row.episodes for row in rows} == {(3, 2): 40, (3, 1): 10, (4, 1): 10, (4, 2): 10}
+    folder = RunFolder(tmp_path / cell.key)
+    weights = read_saved_policy(folder.policy, cell.config, env_shape(cell.config.env))
+    for row in rows:
+        stored = load_evaluation(folder.path / "evaluations" / f"{row.robots}r{row.groups}g.zarr")
+        world = dataclasses.replace(cell.config.world, robots=row.robots, groups=row.groups)
+        assert stored.spec.world == world and stored.updates == weights.version
+        np.testing.assert_array_equal(stored.seed, np.arange(77, 77 + row.episodes))
+        played = evaluate(stored.spec, weights, stored.seed.tolist())
+        np.testing.assert_array_equal(stored.stats.outcome, played.outcome)
+        assert [row.count(kind) for kind in ENDED] == [int((played.outcome == kind).sum()) for kind in ENDED]
+        assert row.mean_length_steps == pytest.approx(played.length_steps.mean(), abs=0.005)
+        assert (row.trained_robots, row.trained_groups, row.seed, row.config) == (3, 2, 3, cell_hash(cell.config))
+    client, runs = runs_of(store, cell)
+    fixed = next(row for row in rows if row.is_fixed)
+    assert len(runs) == 1 and runs[0].info.status == "FINISHED"
+    assert runs[0].data.metrics["final/success_rate"] == fixed.count(Outcome.GOAL) / 40
+    assert runs[0].data.tags["preset"] == "thesis" and runs[0].data.tags["setup"] == "3r×2g"
+    artifacts = {item.path for item in client.list_artifacts(runs[0].info.run_id)}
+    assert artifacts == {"results.csv", "policy.safetensors"}
+    assert not folder.checkpoints.exists()
+
+
+def test_a_finished_cell_is_not_run_again(store, cell, tmp_path):
+    place = SweepPlace(tmp_path, store, "cells")
+    table = run_cell(SWEEP, cell, place, lambda row: None)
+    before = table.stat().st_mtime_ns
+    assert run_cell(SWEEP, cell, place, crashing_at(0)) == table
+    assert table.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("crashes", [[0], [1_500], [2_600, 3_500]])
+def test_a_crashed_cell_ends_as_if_nothing_had_happened(store, cell, tmp_path, crashes):
+    key = f"{cell.key}-{len(crashes)}-{crashes[0]}"  # each case has its run
+    cell = cell._replace(key=key)
+    whole = read_table(run_cell(SWEEP, cell._replace(key=f"{key}-whole"), SweepPlace(tmp_path, store, "cells"), id))
+    place = SweepPlace(tmp_path, store, "cells")
+    for env_steps in crashes:
+        with pytest.raises(Crash):
+            run_cell(SWEEP, cell, place, crashing_at(env_steps))
+        assert not (tmp_path / key / "results.csv").exists()
+    assert read_table(run_cell(SWEEP, cell, place, id)) == whole
+    client, runs = runs_of(store, cell)
+    assert len(runs) == 1 and runs[0].info.status == "FINISHED"
+    history = client.get_metric_history(runs[0].info.run_id, "eval/success_rate")
+    assert len({metric.step for metric in history}) == len(history) >= 3
+
+
+def test_a_cell_whose_folder_is_gone_keeps_its_mlflow_run(store, cell, tmp_path):
+    cell = cell._replace(key=f"{cell.key}-gone")
+    place = SweepPlace(tmp_path, store, "cells")
+    with pytest.raises(Crash):
+        run_cell(SWEEP, cell, place, crashing_at(2_000))
+    shutil.rmtree(tmp_path / cell.key)
+    run_cell(SWEEP, cell, place, id)
+    assert len(runs_of(store, cell)[1]) == 1
