@@ -98,7 +98,8 @@ def sweep(command: Sweep) -> int:
     missing = [cell for cell in results.cells if cell.key not in done]
     if missing:
         place = SweepPlace(folder / CELLS, launch.tracking(), launch.sweep_experiment(name))
-        Tracker(place.tracking_uri, place.experiment, launch.artifact_root())  # one process makes store and experiment
+        # One process makes store and experiment, before several open them.
+        Tracker(place.tracking_uri, place.experiment, launch.artifact_root()).set_views()
         with board:
             listener = _Listener(board, results)
             run_cells(command.grid, missing, place, launch.ray_address(), command.at_once, listener)

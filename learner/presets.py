@@ -2,9 +2,9 @@
 
 `thesis` takes what the text says: one-step updates (Algorithms 1 and 2), epsilon 0.05, learning rate 0.001, the
 numbers of Tables 3.2 and 4.2. It says nothing of how long and how often to update, nor how exploration begins: those
-are calibrated on seeds that no evaluation uses (README of `sim_core`, open questions). For M_IN and M_OUT
-all robots of a group span its ellipse, as the text has it, and the sum u_nn + u_apf may be twice as fast as u_nn, as the
-text bounds neither.
+are calibrated on seeds that no evaluation uses (README of `sim_core`, open questions). For M_IN and M_OUT all robots
+of a group span its ellipse, as the text has it, and the sum u_nn + u_apf may be twice as fast as u_nn, since the text
+bounds neither.
 
 `best` keeps state, actions, reward and worlds of each method and changes only how it is learned.
 """

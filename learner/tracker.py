@@ -8,6 +8,7 @@ import math
 import os
 import socket
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -19,6 +20,7 @@ from actors.network import QNetwork, WeightsSnapshot, load_snapshot
 from actors.vector_env import EnvShape
 from learner.config import RunConfig, config_hash
 from learner.journal import Row
+from learner.views import TAG, packed_view, sweep_views
 from sim_core.checks import ConfigError
 
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
@@ -166,6 +168,15 @@ class Tracker:
             self._client.log_artifacts(self.run_id, str(path), path.name)
         else:
             self._client.log_artifact(self.run_id, str(path))
+
+    def set_views(self) -> None:
+        """Gives the experiment the views of `learner.views`; a store that does not take them goes without."""
+        now_ms = int(time.time() * 1000)
+        for key, (name, state) in sweep_views().items():
+            try:
+                self._client.set_experiment_tag(self._experiment_id, TAG + key, packed_view(name, state, now_ms))
+            except MlflowException as error:
+                logging.getLogger(__name__).warning("no MLflow view %r: %s", name, str(error).splitlines()[0])
 
     def end(self, status: str) -> None:
         """Closes the run as FINISHED, KILLED or FAILED."""
