@@ -3,21 +3,18 @@
 import dataclasses
 import json
 import signal
-import subprocess
-import sys
-import time
 from collections import Counter
 from pathlib import Path
 
 import mlflow
-import psutil
 import pytest
 from safetensors.numpy import load_file
 
 from learner.checkpoint import newest_valid
 from learner.config import to_dict
 from learner.tracker import flat_params
-from tests.integration.conftest import SMALL, clean_environment, flags
+from tests.integration.conftest import SMALL, flags
+from tests.integration.jobs import Job
 
 pytestmark = [
     pytest.mark.ray,
@@ -25,42 +22,6 @@ pytestmark = [
 ]
 
 LONG = dataclasses.replace(SMALL, engine="ray", total_env_steps=400_000, checkpoint_every_env_steps=4_000)
-
-
-class Job:
-    """`shoal` in the background, in an empty folder."""
-
-    def __init__(self, folder: Path, *arguments: str) -> None:
-        self.folder = folder
-        self.log = folder / "job.log"
-        with self.log.open("w") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "deploy", *arguments],
-                cwd=folder,
-                env=clean_environment(),
-                stdout=log,
-                stderr=subprocess.STDOUT,
-            )
-
-    def wait_for_checkpoints(self, run: str, count: int) -> None:
-        root = self.folder / "runs" / run / "checkpoints"
-        seen: set[str] = set()
-        deadline_s = time.monotonic() + 120
-        while len(seen) < count:
-            assert self.process.poll() is None, self.log.read_text()
-            assert time.monotonic() < deadline_s, self.log.read_text()
-            seen |= {path.name for path in root.glob("step-*") if path.suffix != ".part"}
-            time.sleep(0.05)
-
-    def kill_all(self) -> None:
-        """SIGKILL for the driver and every process that it started."""
-        driver = psutil.Process(self.process.pid)
-        family = [driver, *driver.children(recursive=True)]
-        assert len(family) > 3, "Ray runs in processes of its own"
-        for process in family:
-            process.kill()
-        psutil.wait_procs(family, timeout=30)
-        self.process.wait(30)
 
 
 def the_run(folder: Path):

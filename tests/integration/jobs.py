@@ -1,0 +1,49 @@
+"""Commands in the background that tests kill."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+
+from tests.integration.conftest import clean_environment
+
+
+class Job:
+    """`shoal` in the background, in an empty folder."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self.folder = folder
+        self.log = folder / "job.log"
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "deploy", *arguments],
+                cwd=folder,
+                env=clean_environment(),
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
+
+    def wait_for_files(self, pattern: str, count: int) -> None:
+        """Waits until files of `count` different names under the folder have been seen while the job runs."""
+        seen: set[Path] = set()
+        deadline_s = time.monotonic() + 120
+        while len(seen) < count:
+            assert self.process.poll() is None, self.log.read_text()
+            assert time.monotonic() < deadline_s, self.log.read_text()
+            seen |= {path for path in self.folder.glob(pattern) if path.suffix != ".part"}
+            time.sleep(0.05)
+
+    def wait_for_checkpoints(self, run: str, count: int) -> None:
+        self.wait_for_files(f"runs/{run}/checkpoints/step-*", count)
+
+    def kill_all(self) -> None:
+        """SIGKILL for the driver and every process that it started."""
+        driver = psutil.Process(self.process.pid)
+        family = [driver, *driver.children(recursive=True)]
+        assert len(family) > 3, "Ray runs in processes of its own"
+        for process in family:
+            process.kill()
+        psutil.wait_procs(family, timeout=30)
+        self.process.wait(30)

@@ -1,0 +1,90 @@
+"""A sweep over Ray Tune: killed twice and run again, it has every cell once, as if nothing had happened."""
+
+import mlflow
+import pytest
+
+from actors.result_table import read_table, write_table
+from deploy.cli import main
+from learner.sweep import SweepConfig, make_cells
+from learner.tracker import Tracker
+from learner.trial import SweepPlace, run_cell
+from tests.integration.jobs import Job
+
+pytestmark = [
+    pytest.mark.ray,
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:DeprecationWarning"),  # MLflow's own query
+]
+
+SWEEP = SweepConfig(
+    methods=("sensor", "in"),
+    robots=(5,),
+    groups=(1, 2),
+    seeds=(0,),
+    env_steps=60_000,
+    episodes=20,
+    extrapolation_episodes=5,
+)
+GRID = "--methods sensor in --robots 5 --groups 1 2 --seeds 0 --episodes 20 --extrapolation-episodes 5".split()
+COMMAND = ["sweep", *GRID, "--env-steps", "60000", "--name", "s"]
+
+
+def results_in_one_process(folder):
+    """What the cells give when each is run in this process."""
+    uri = f"sqlite:///{folder / 'mlflow.db'}"
+    Tracker(uri, "cells", str(folder / "artifacts"))
+    place = SweepPlace(folder / "cells", uri, "cells")
+    tables = [run_cell(SWEEP, cell, place, lambda row: None) for cell in make_cells(SWEEP)]
+    mlflow.set_tracking_uri(None)
+    return sorted(row for table in tables for row in read_table(table))
+
+
+def test_a_sweep_that_is_killed_twice_has_every_cell_once(shoal, tmp_path):
+    for cells_done in (1, 2):
+        job = Job(tmp_path, *COMMAND)
+        job.wait_for_files("runs/sweeps/s/cells/*/results.csv", cells_done)
+        job.kill_all()
+    done = shoal(*COMMAND)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "4 of 4 cells" in done.stdout
+    assert read_table(tmp_path / "runs/sweeps/s/results.csv") == results_in_one_process(tmp_path / "alone")
+
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/runs/mlflow.db")
+    experiment = client.get_experiment_by_name("sweep s")
+    runs = client.search_runs([experiment.experiment_id])
+    assert sorted(run.data.tags["cell"] for run in runs) == sorted(cell.key for cell in make_cells(SWEEP))
+    assert {run.info.status for run in runs} == {"FINISHED"}
+    assert sum(name.startswith("mlflow.sharedViewState.") for name in experiment.tags) >= 4
+
+    again = shoal(*COMMAND)
+    assert again.returncode == 0 and "4 of 4 cells" in again.stdout
+    assert len(client.search_runs([experiment.experiment_id])) == 4
+
+
+def test_cells_of_an_earlier_sitting_are_not_run_again(capsys, tmp_path, monkeypatch):
+    rows = results_in_one_process(tmp_path / "alone")
+    known = tmp_path / "known.csv"
+    write_table(known, rows)
+    monkeypatch.chdir(tmp_path)
+    assert main([*COMMAND, "--known", str(known)]) == 0
+    assert "4 of 4 cells" in capsys.readouterr().out
+    assert read_table(tmp_path / "runs/sweeps/s/results.csv") == rows
+    assert not (tmp_path / "runs/sweeps/s/cells").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--robots", "400"], "does not fit"),
+        (["--episodes", "0"], "episodes must be at least 1"),
+        (["--env-steps", "100"], "min_replay"),
+        (["--known", "missing.csv"], "missing.csv cannot be read"),
+        (["--name", "../up"], "--name must be a plain folder name"),
+        (["--at-once", "0"], "--at-once must be at least 1"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_runs(capsys, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert main(["sweep", *arguments]) == 2
+    assert words in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
