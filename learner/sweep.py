@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 from actors.result_table import LEARNED, ResultRow
 from learner.config import RunConfig, to_dict
@@ -33,6 +34,8 @@ class SweepConfig:
     """Settings of every training: the text's reading, or our best."""
     methods: tuple[MethodName, ...] = ("sensor", "in", "out")
     """State representations."""
+    set: tuple[str, ...] = ()
+    """Settings in place of the preset's, as NAME=VALUE: any field of `shoal train`, for calibration."""
     robots: tuple[int, ...] = ROBOTS
     """Robots per group."""
     groups: tuple[int, ...] = GROUPS
@@ -45,7 +48,7 @@ class SweepConfig:
     """Fixed: greedy episodes in the setup of the training (3.3: 30 iterations of 100)."""
     extrapolation: Literal["all", "none"] = "all"
     """Extrapolation: every policy in every other setup that it fits (M_IN, M_OUT: of as many groups), or none."""
-    extrapolation_episodes: int = 500
+    extrapolation_episodes: int = 300
     """Extrapolation: greedy episodes in each other setup."""
     first_seed: int = 2_000_000_000
     """Seed of the first evaluated episode; the others count on. Calibration uses others than the evaluation."""
@@ -61,8 +64,39 @@ class SweepConfig:
         for name in ("episodes", "extrapolation_episodes", "env_steps"):
             value = getattr(self, name)
             require(value is None or value >= 1, f"{name} must be at least 1, not {value}")
+        changed_settings(self.set)
         most = 2**32 - 1 - max(self.episodes, self.extrapolation_episodes)
         require(0 <= self.first_seed <= most, f"first_seed must be in 0..{most}, not {self.first_seed}")
+
+    @property
+    def label(self) -> str:
+        """What the results' column `preset` says: the preset and what was set in its place."""
+        return "+".join((self.preset, *self.set))
+
+
+def changed_settings(assignments: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The run's and the world's settings of NAME=VALUE texts; values are those of TOML, names those of the fields.
+
+    Raises:
+      ConfigError: a text is no assignment, or its name no setting that a sweep leaves free.
+    """
+    run: dict[str, Any] = {}
+    world: dict[str, Any] = {}
+    for text in assignments:
+        name, sign, value = text.partition("=")
+        require(bool(sign) and bool(name), f"set takes NAME=VALUE, not {text!r}")
+        fixed = name in ("world", "seed", "engine", "method", "robots", "groups", "env_id")
+        require(
+            not fixed and (name in RunConfig.__dataclass_fields__ or name in WorldConfig.__dataclass_fields__),
+            f"set cannot change {name!r}; `shoal train --help` lists the settings",
+        )
+        try:
+            parsed = tomllib.loads(f"value = {value}")["value"]
+        except tomllib.TOMLDecodeError:
+            parsed = value  # a plain word
+        part = run if name in RunConfig.__dataclass_fields__ else world
+        part[name] = tuple(parsed) if isinstance(parsed, list) else parsed
+    return run, world
 
 
 class Cell(NamedTuple):
@@ -91,9 +125,11 @@ def make_cell(sweep: SweepConfig, method: MethodName, robots: int, groups: int, 
       ConfigError: the setup is not possible.
     """
     preset = preset_config(sweep.preset, method, robots, groups)
+    run, world = changed_settings(sweep.set)
     env_steps = sweep.env_steps or preset.total_env_steps
     config = dataclasses.replace(
         preset,
+        world=dataclasses.replace(preset.world, **world),
         total_env_steps=env_steps,
         learning_rate_decay_env_steps=env_steps,
         seed=seed,
@@ -101,6 +137,7 @@ def make_cell(sweep: SweepConfig, method: MethodName, robots: int, groups: int, 
         final_eval_episodes=sweep.episodes,
         final_eval_first_seed=sweep.first_seed,
     )
+    config = dataclasses.replace(config, **run)
     return Cell(f"{method}-{robots}r{groups}g-s{seed}-{cell_hash(config)}", config)
 
 
@@ -146,7 +183,7 @@ def done_cells(sweep: SweepConfig, cells: Iterable[Cell], rows: Iterable[ResultR
     """The results of every cell, by key, that `rows` hold in full; a cell of which they hold a part is left out."""
     by_config: dict[str, dict[tuple[int, int], ResultRow]] = {}
     for row in rows:
-        if row.policy == LEARNED and row.preset == sweep.preset:
+        if row.policy == LEARNED and row.preset == sweep.label:
             by_config.setdefault(row.config, {})[row.robots, row.groups] = row
     done = {}
     for cell in cells:

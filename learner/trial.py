@@ -65,7 +65,7 @@ def result_row(sweep: SweepConfig, config: RunConfig, played: WorldConfig, stats
     """The row of one evaluation: the policy that `config` trained, in the world `played`."""
     counts = {kind.name.lower(): int((stats.outcome == kind).sum()) for kind in ENDED}
     return ResultRow(
-        preset=sweep.preset,
+        preset=sweep.label,
         policy=LEARNED,
         method=played.method,
         trained_robots=config.world.robots,
@@ -94,7 +94,7 @@ def _start_or_find(cell: Cell, sweep: SweepConfig, folder: RunFolder, place: Swe
 
 
 def _tags(cell: Cell, sweep: SweepConfig) -> dict[str, str]:
-    return {"cell": cell.key, "preset": sweep.preset, "setup": cell.config.world.setup}
+    return {"cell": cell.key, "preset": sweep.label, "setup": cell.config.world.setup}
 
 
 def _checkpoint(folder: RunFolder, config: RunConfig) -> Checkpoint | None:

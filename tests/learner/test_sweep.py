@@ -81,6 +81,38 @@ def test_the_length_of_the_training_takes_its_schedule_along():
     assert config.total_env_steps == config.learning_rate_decay_env_steps == 400_000
 
 
+def test_settings_take_the_place_of_the_presets():
+    sweep = dataclasses.replace(SMALL, set=("n_step=5", "apf_rows=all", "time_step_s=0.04", "hidden_sizes=[64, 32]"))
+    config, preset = make_cell(sweep, "in", 5, 2, 0).config, make_cell(SMALL, "in", 5, 2, 0).config
+    assert (config.n_step, config.hidden_sizes, config.world.apf_rows) == (5, (64, 32), "all")
+    world = dataclasses.replace(config.world, apf_rows=preset.world.apf_rows, time_step_s=preset.world.time_step_s)
+    assert dataclasses.replace(config, n_step=preset.n_step, hidden_sizes=preset.hidden_sizes, world=world) == preset
+    assert sweep.label == "thesis+n_step=5+apf_rows=all+time_step_s=0.04+hidden_sizes=[64, 32]"
+    assert SMALL.label == "thesis"
+    rows = rows_of(SMALL, make_cell(SMALL, "in", 5, 2, 0))
+    assert not done_cells(sweep, make_cells(sweep), rows)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("n_step", "NAME=VALUE"),
+        ("=3", "NAME=VALUE"),
+        ("n_stp=3", "cannot change 'n_stp'"),
+        ("robots=7", "cannot change 'robots'"),
+        ("seed=7", "cannot change 'seed'"),
+    ],
+)
+def test_what_is_no_setting_is_refused(text, words):
+    with pytest.raises(ConfigError, match=words):
+        SweepConfig(set=(text,))
+
+
+def test_a_setting_that_cannot_work_is_refused_before_anything_runs():
+    with pytest.raises(ConfigError, match="n_step must be a whole number"):
+        make_cells(dataclasses.replace(SMALL, set=("n_step=three",)))
+
+
 def test_a_cell_is_done_when_all_its_results_are_there():
     cells = make_cells(SMALL)
     rows = [row for cell in cells for row in rows_of(SMALL, cell)]
