@@ -142,7 +142,7 @@ def make_cell(sweep: SweepConfig, method: MethodName, robots: int, groups: int, 
 
 
 def make_cells(sweep: SweepConfig) -> list[Cell]:
-    """All cells: seed after seed, within a seed the costliest first, so that cores end together.
+    """All cells: seed after seed, within a seed the cheapest first, so that most results come early.
 
     Raises:
       ConfigError: a setup is not possible.
@@ -155,7 +155,7 @@ def make_cells(sweep: SweepConfig) -> list[Cell]:
             for robots in sweep.robots
             for groups in sweep.groups
         ]
-        cells += sorted(of_seed, key=lambda cell: -cell.weight)
+        cells += sorted(of_seed, key=lambda cell: cell.weight)
     return cells
 
 
