@@ -10,7 +10,7 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 
-from actors.result_table import ResultRow
+from actors.result_table import LEARNED, ResultRow
 from learner.sweep import Cell
 
 REFRESHES_PER_S = 2.0
@@ -56,13 +56,13 @@ class SweepBoard:
         """A cell is done."""
         self._steps.pop(key, None)
         self._rates[key] = _success(rows)
-        self.say(f"{self._cells[key].config.name}: success {self._rates[key]:.1%}  {self.summary()}")
+        self.say(f"{self._cells[key].name}: success {self._rates[key]:.1%}  {self.summary()}")
 
     def failed(self, key: str, reason: str) -> None:
         """A cell has crashed for the last time."""
         self._steps.pop(key, None)
         self._failures[key] = reason
-        self.say(f"{self._cells[key].config.name} failed: {reason}")
+        self.say(f"{self._cells[key].name} failed: {reason}")
 
     def say(self, text: str) -> None:
         """A line for people who read a log."""
@@ -70,7 +70,7 @@ class SweepBoard:
 
     def failures(self) -> list[str]:
         """One line for each cell that has failed."""
-        return [f"{self._cells[key].config.name}: {reason}" for key, reason in self._failures.items()]
+        return [f"{self._cells[key].name}: {reason}" for key, reason in self._failures.items()]
 
     def _share(self, key: str) -> float:
         """How much of a cell is done; training counts as nine tenths of it."""
@@ -95,24 +95,27 @@ class SweepBoard:
         return f"[{len(self._rates)} of {len(self._cells)} cells, {len(self._steps)} running{failed}{left}]"
 
     def table(self) -> Table:
-        """Success rates, robots x method down, groups across; mean over the seeds that are done."""
+        """Success rates, robots x policy down, groups across; mean over the seeds that are done."""
         worlds = [cell.config.world for cell in self._cells.values()]
-        groups = sorted({world.groups for world in worlds})
+        groups, robots = sorted({world.groups for world in worlds}), sorted({world.robots for world in worlds})
         table = Table(title="success rate", title_justify="left")
-        table.add_column("method")
+        table.add_column("policy")
         table.add_column("robots", justify="right")
         for count in groups:
             table.add_column(f"{count} group{'s' if count > 1 else ''}", justify="right")
-        for method in dict.fromkeys(world.method for world in worlds):
-            for robots in sorted({world.robots for world in worlds}):
-                table.add_row(method, str(robots), *(self._cell_text(method, robots, count) for count in groups))
+        for kind in dict.fromkeys(_kind(cell) for cell in self._cells.values()):
+            for count in robots:
+                table.add_row(kind, str(count), *(self._cell_text(kind, count, groups_of) for groups_of in groups))
             table.add_section()
         return table
 
-    def _cell_text(self, method: str, robots: int, groups: int) -> str:
-        place = (method, robots, groups)
-        worlds = {key: cell.config.world for key, cell in self._cells.items()}
-        keys = [key for key, world in worlds.items() if (world.method, world.robots, world.groups) == place]
+    def _cell_text(self, kind: str, robots: int, groups: int) -> str:
+        place = (kind, robots, groups)
+        keys = [
+            key
+            for key, cell in self._cells.items()
+            if (_kind(cell), cell.config.world.robots, cell.config.world.groups) == place
+        ]
         rates = [self._rates[key] for key in keys if key in self._rates]
         parts = [f"{sum(rates) / len(rates):.1%}"] if rates else []
         parts += [f"▸{self._share(key):.0%}" for key in keys if key in self._steps]
@@ -148,6 +151,12 @@ class LiveBoard(SweepBoard):
 
     def _render(self) -> RenderableType:
         return Group(self.table(), self.summary())
+
+
+def _kind(cell: Cell) -> str:
+    """What stands in a row of the table: a method, or a baseline in a method's world."""
+    method = cell.config.world.method
+    return method if cell.policy == LEARNED else f"{cell.policy}, {method}"
 
 
 def _success(rows: list[ResultRow]) -> float:

@@ -16,6 +16,7 @@ from learner.presets import MethodName, PresetName, preset_config
 from sim_core.checks import check_fields, require
 from sim_core.config import WorldConfig
 
+BaselineName = Literal["fl-orca", "greedy", "random"]
 ROBOTS = (5, 10, 15, 20, 25)
 """Robots per group of the dissertation's setups (3.3)."""
 GROUPS = (1, 2, 3, 4, 8)
@@ -50,22 +51,31 @@ class SweepConfig:
     """Extrapolation: every policy in every other setup that it fits (M_IN, M_OUT: of as many groups), or none."""
     extrapolation_episodes: int = 300
     """Extrapolation: greedy episodes in each other setup."""
+    baselines: tuple[BaselineName, ...] = ("fl-orca", "greedy")
+    """Rules that need no learning (see `shoal evaluate`), played in every setup as the policies are; may be empty."""
+    baseline_episodes: int = 500
+    """Episodes of each baseline in each setup."""
     first_seed: int = 2_000_000_000
     """Seed of the first evaluated episode; the others count on. Calibration uses others than the evaluation."""
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name in ("methods", "robots", "groups", "seeds"):
+        for name in ("methods", "robots", "groups", "seeds", "baselines"):
             values = getattr(self, name)
-            require(isinstance(values, tuple) and len(values) > 0, f"{name} must have at least one value")
+            some = isinstance(values, tuple) and (len(values) > 0 or name == "baselines")
+            require(some, f"{name} must have at least one value")
             require(len(set(values)) == len(values), f"{name} must not repeat a value, as in {values}")
-        known = get_args(MethodName)
-        require(set(self.methods) <= set(known), f"methods must be among {', '.join(known)}, not {self.methods}")
-        for name in ("episodes", "extrapolation_episodes", "env_steps"):
+        for name, known in (("methods", get_args(MethodName)), ("baselines", get_args(BaselineName))):
+            given = getattr(self, name)
+            require(
+                all(value in known for value in given),
+                f"{name} must be among {', '.join(known)}, not {given}",
+            )
+        for name in ("episodes", "extrapolation_episodes", "baseline_episodes", "env_steps"):
             value = getattr(self, name)
             require(value is None or value >= 1, f"{name} must be at least 1, not {value}")
         changed_settings(self.set)
-        most = 2**32 - 1 - max(self.episodes, self.extrapolation_episodes)
+        most = 2**32 - 1 - max(self.episodes, self.extrapolation_episodes, self.baseline_episodes)
         require(0 <= self.first_seed <= most, f"first_seed must be in 0..{most}, not {self.first_seed}")
 
     @property
@@ -100,15 +110,24 @@ def changed_settings(assignments: tuple[str, ...]) -> tuple[dict[str, Any], dict
 
 
 class Cell(NamedTuple):
-    """One training of a sweep; `key` tells configs apart and names its folder."""
+    """One training of a sweep, or a baseline in one setup; `key` tells configs apart and names its folder."""
 
     key: str
     config: RunConfig
+    policy: str = LEARNED
+
+    @property
+    def name(self) -> str:
+        """What people call it, such as `sensor 10r×2g s0` or `greedy: sensor 10r×2g`."""
+        world = self.config.world
+        return self.config.name if self.policy == LEARNED else f"{self.policy}: {world.method} {world.setup}"
 
     @property
     def weight(self) -> float:
         """What the cell costs, roughly: env steps x (robots and a part for perception and learning)."""
-        return self.config.total_env_steps * (self.config.world.num_robots + 60.0)
+        robots, steps = self.config.world.num_robots, self.config.world.horizon_steps * self.config.final_eval_episodes
+        played = steps * (robots + 10.0)
+        return played + (self.config.total_env_steps * (robots + 60.0) if self.policy == LEARNED else 0.0)
 
 
 def cell_hash(config: RunConfig) -> str:
@@ -142,21 +161,28 @@ def make_cell(sweep: SweepConfig, method: MethodName, robots: int, groups: int, 
 
 
 def make_cells(sweep: SweepConfig) -> list[Cell]:
-    """All cells: seed after seed, within a seed the cheapest first, so that most results come early.
+    """All cells: baselines, then seed after seed; of each the cheapest first, so that most results come early.
 
     Raises:
       ConfigError: a setup is not possible.
     """
-    cells: list[Cell] = []
-    for seed in sweep.seeds:
-        of_seed = [
-            make_cell(sweep, method, robots, groups, seed)
-            for method in sweep.methods
-            for robots in sweep.robots
-            for groups in sweep.groups
-        ]
-        cells += sorted(of_seed, key=lambda cell: cell.weight)
-    return cells
+    setups = [(method, r, g) for method in sweep.methods for r in sweep.robots for g in sweep.groups]
+    parts = [[make_baseline_cell(sweep, baseline, *setup) for setup in setups] for baseline in sweep.baselines]
+    parts += [[make_cell(sweep, *setup, seed) for setup in setups] for seed in sweep.seeds]
+    return [cell for part in parts for cell in sorted(part, key=lambda cell: cell.weight)]
+
+
+def make_baseline_cell(
+    sweep: SweepConfig, baseline: BaselineName, method: MethodName, robots: int, groups: int
+) -> Cell:
+    """The cell of a baseline in the world that the preset gives a method in one setup.
+
+    Raises:
+      ConfigError: the setup is not possible.
+    """
+    trained = make_cell(sweep, method, robots, groups, 0).config
+    config = dataclasses.replace(trained, final_eval_episodes=sweep.baseline_episodes)
+    return Cell(f"{baseline}-{method}-{robots}r{groups}g-{cell_hash(config)}", config, baseline)
 
 
 def other_worlds(sweep: SweepConfig, cell: Cell) -> list[WorldConfig]:
@@ -165,7 +191,7 @@ def other_worlds(sweep: SweepConfig, cell: Cell) -> list[WorldConfig]:
     M_sensor's state has the same size in all; that of M_IN and M_OUT has a row a group, so groups stay.
     """
     world = cell.config.world
-    if sweep.extrapolation == "none":
+    if sweep.extrapolation == "none" or cell.policy != LEARNED:
         return []
     groups = sweep.groups if world.method == "sensor" else (world.groups,)
     setups = [(r, g) for r in sweep.robots for g in groups if (r, g) != (world.robots, world.groups)]
@@ -174,20 +200,20 @@ def other_worlds(sweep: SweepConfig, cell: Cell) -> list[WorldConfig]:
 
 def wanted(sweep: SweepConfig, cell: Cell) -> dict[tuple[int, int], int]:
     """Episodes that a cell's results must have, by (robots, groups) played in."""
-    world = cell.config.world
+    world, fixed = cell.config.world, cell.config.final_eval_episodes
     others = {(w.robots, w.groups): sweep.extrapolation_episodes for w in other_worlds(sweep, cell)}
-    return {(world.robots, world.groups): sweep.episodes} | others
+    return {(world.robots, world.groups): fixed} | others
 
 
 def done_cells(sweep: SweepConfig, cells: Iterable[Cell], rows: Iterable[ResultRow]) -> dict[str, list[ResultRow]]:
     """The results of every cell, by key, that `rows` hold in full; a cell of which they hold a part is left out."""
-    by_config: dict[str, dict[tuple[int, int], ResultRow]] = {}
+    by_cell: dict[tuple[str, str], dict[tuple[int, int], ResultRow]] = {}
     for row in rows:
-        if row.policy == LEARNED and row.preset == sweep.label:
-            by_config.setdefault(row.config, {})[row.robots, row.groups] = row
+        if row.preset == sweep.label:
+            by_cell.setdefault((row.policy, row.config), {})[row.robots, row.groups] = row
     done = {}
     for cell in cells:
-        found, need = by_config.get(cell_hash(cell.config), {}), wanted(sweep, cell)
+        found, need = by_cell.get((cell.policy, cell_hash(cell.config)), {}), wanted(sweep, cell)
         if all(setup in found and found[setup].episodes >= count for setup, count in need.items()):
             done[cell.key] = [found[setup] for setup in need]
     return done

@@ -101,7 +101,7 @@ class Tracker:
             "config_hash": config_hash(config),
             "mlflow.source.git.commit": git_commit(),
         }
-        run = self._client.create_run(self._experiment_id, run_name=config.name, tags=known | (tags or {}))
+        run = self._client.create_run(self._experiment_id, tags={"mlflow.runName": config.name} | known | (tags or {}))
         self.run_id = run.info.run_id
         params = [Param(key, str(value)) for key, value in flat_params(config).items()]
         self._client.log_batch(self.run_id, params=params)

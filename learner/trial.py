@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from actors.baselines import Baseline
 from actors.evaluation_store import StoredEvaluation, save_evaluation
 from actors.evaluator import evaluate
 from actors.network import WeightsSnapshot
@@ -24,6 +26,7 @@ from learner.checkpoint import Checkpoint, CheckpointError
 from learner.config import RunConfig
 from learner.journal import Row
 from learner.policy_file import save_policy
+from learner.results import final_metrics, summarise
 from learner.run import RunResult, execute, resume_point
 from learner.run_folder import RunFolder, RunIdentity
 from learner.sweep import Cell, SweepConfig, cell_hash, other_worlds
@@ -61,12 +64,13 @@ class RowDisplay:
         """A cell says nothing."""
 
 
-def result_row(sweep: SweepConfig, config: RunConfig, played: WorldConfig, stats: EpisodeStats) -> ResultRow:
-    """The row of one evaluation: the policy that `config` trained, in the world `played`."""
+def result_row(sweep: SweepConfig, cell: Cell, played: WorldConfig, stats: EpisodeStats) -> ResultRow:
+    """The row of one evaluation of a cell's policy, in the world `played`."""
+    config = cell.config
     counts = {kind.name.lower(): int((stats.outcome == kind).sum()) for kind in ENDED}
     return ResultRow(
         preset=sweep.label,
-        policy=LEARNED,
+        policy=cell.policy,
         method=played.method,
         trained_robots=config.world.robots,
         trained_groups=config.world.groups,
@@ -89,12 +93,18 @@ def _start_or_find(cell: Cell, sweep: SweepConfig, folder: RunFolder, place: Swe
     else:
         tracker.start(cell.config, _tags(cell, sweep))
     folder.save_config(cell.config)
-    folder.save_identity(RunIdentity(cell.config.name, tracker.uri, place.experiment, tracker.run_id))
+    folder.save_identity(RunIdentity(cell.name, tracker.uri, place.experiment, tracker.run_id))
     return tracker
 
 
 def _tags(cell: Cell, sweep: SweepConfig) -> dict[str, str]:
-    return {"cell": cell.key, "preset": sweep.label, "setup": cell.config.world.setup}
+    return {
+        "cell": cell.key,
+        "preset": sweep.label,
+        "policy": cell.policy,
+        "setup": cell.config.world.setup,
+        "mlflow.runName": cell.name,
+    }
 
 
 def _checkpoint(folder: RunFolder, config: RunConfig) -> Checkpoint | None:
@@ -121,20 +131,41 @@ def run_cell(sweep: SweepConfig, cell: Cell, place: SweepPlace, on_row: Callable
     if table.is_file():
         return table
     tracker = _start_or_find(cell, sweep, folder, place)
+    (_play_baseline if cell.policy != LEARNED else _train)(sweep, cell, folder, tracker, on_row)
+    (folder.artifacts / RESULTS).rename(table)  # once MLflow has all and its run is closed
+    shutil.rmtree(folder.checkpoints, ignore_errors=True)  # the policy and the results stay
+    return table
+
+
+def _train(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker, on_row: Callable[[Row], None]) -> None:
+    """Trains from the newest checkpoint, and evaluates the policy."""
 
     def finish(result: RunResult, rows: list[Row]) -> None:
         assert result.weights is not None and result.episodes is not None
         save_policy(folder.policy, result.weights, cell.config, env_shape(cell.config.env))
         results = _evaluate_all(sweep, cell, folder, result.weights, result.episodes)
         tracker.artifact(folder.policy)
-        part = folder.artifacts / RESULTS
-        write_table(part, results)
-        tracker.artifact(part)
-        part.replace(table)
+        _log_table(results, folder, tracker)
 
     execute(folder, cell.config, tracker, RowDisplay(on_row), _checkpoint(folder, cell.config), None, finish)
-    shutil.rmtree(folder.checkpoints, ignore_errors=True)  # the policy and the results stay
-    return table
+
+
+def _play_baseline(
+    sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker, on_row: Callable[[Row], None]
+) -> None:
+    """Plays a baseline's episodes, of which there is nothing to resume and no training to tell."""
+    seeds = list(range(sweep.first_seed, sweep.first_seed + cell.config.final_eval_episodes))
+    stats = evaluate(cell.config.env, Baseline(cell.policy), seeds)
+    tracker.final(final_metrics(summarise(stats)), int(time.time() * 1000))
+    _log_table([_stored(sweep, cell, cell.config, stats, folder, 0)], folder, tracker)
+    tracker.end("FINISHED")
+
+
+def _log_table(results: list[ResultRow], folder: RunFolder, tracker: Tracker) -> None:
+    """Writes and logs the table of a cell's results, which does not count yet."""
+    table = folder.artifacts / RESULTS
+    write_table(table, results)
+    tracker.artifact(table)
 
 
 def _evaluate_all(
@@ -142,21 +173,21 @@ def _evaluate_all(
 ) -> list[ResultRow]:
     """Stores the Fixed evaluation, makes and stores the Extrapolations, and counts them all."""
     config = cell.config
-    results = [_stored(sweep, config, config, fixed, folder, weights.version)]
+    results = [_stored(sweep, cell, config, fixed, folder, weights.version)]
     seeds = list(range(sweep.first_seed, sweep.first_seed + sweep.extrapolation_episodes))
     for world in other_worlds(sweep, cell):
         played = dataclasses.replace(config, world=world)
-        results.append(_stored(sweep, played, config, evaluate(played.env, weights, seeds), folder, weights.version))
+        results.append(_stored(sweep, cell, played, evaluate(played.env, weights, seeds), folder, weights.version))
     return results
 
 
 def _stored(
-    sweep: SweepConfig, played: RunConfig, trained: RunConfig, stats: EpisodeStats, folder: RunFolder, updates: int
+    sweep: SweepConfig, cell: Cell, played: RunConfig, stats: EpisodeStats, folder: RunFolder, updates: int
 ) -> ResultRow:
     world = played.world
     path = folder.path / EVALUATIONS / f"{world.robots}r{world.groups}g.zarr"
     path.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(path, ignore_errors=True)  # of an attempt that did not come to its end
     seeds = np.arange(sweep.first_seed, sweep.first_seed + len(stats.outcome))
-    save_evaluation(path, StoredEvaluation(played.env, trained.name, updates, seeds, stats))
-    return result_row(sweep, trained, world, stats)
+    save_evaluation(path, StoredEvaluation(played.env, cell.name, updates, seeds, stats))
+    return result_row(sweep, cell, world, stats)

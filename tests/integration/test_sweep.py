@@ -24,8 +24,11 @@ SWEEP = SweepConfig(
     env_steps=60_000,
     episodes=20,
     extrapolation_episodes=5,
+    baselines=("greedy",),
+    baseline_episodes=10,
 )
 GRID = "--methods sensor in --robots 5 --groups 1 2 --seeds 0 --episodes 20 --extrapolation-episodes 5".split()
+GRID += "--baselines greedy --baseline-episodes 10".split()
 COMMAND = ["sweep", *GRID, "--env-steps", "60000", "--name", "s"]
 
 
@@ -40,13 +43,13 @@ def results_in_one_process(folder):
 
 
 def test_a_sweep_that_is_killed_twice_has_every_cell_once(shoal, tmp_path):
-    for cells_done in (1, 2):
+    for cells_done in (5, 6):
         job = Job(tmp_path, *COMMAND)
         job.wait_for_files("runs/sweeps/s/cells/*/results.csv", cells_done)
         job.kill_all()
     done = shoal(*COMMAND)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "4 of 4 cells" in done.stdout
+    assert "8 of 8 cells" in done.stdout
     assert read_table(tmp_path / "runs/sweeps/s/results.csv") == results_in_one_process(tmp_path / "alone")
 
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/runs/mlflow.db")
@@ -57,8 +60,8 @@ def test_a_sweep_that_is_killed_twice_has_every_cell_once(shoal, tmp_path):
     assert sum(name.startswith("mlflow.sharedViewState.") for name in experiment.tags) >= 4
 
     again = shoal(*COMMAND)
-    assert again.returncode == 0 and "4 of 4 cells" in again.stdout
-    assert len(client.search_runs([experiment.experiment_id])) == 4
+    assert again.returncode == 0 and "8 of 8 cells" in again.stdout
+    assert len(client.search_runs([experiment.experiment_id])) == 8
 
 
 def test_cells_of_an_earlier_sitting_are_not_run_again(capsys, tmp_path, monkeypatch):
@@ -67,7 +70,7 @@ def test_cells_of_an_earlier_sitting_are_not_run_again(capsys, tmp_path, monkeyp
     write_table(known, rows)
     monkeypatch.chdir(tmp_path)
     assert main([*COMMAND, "--known", str(known)]) == 0
-    assert "4 of 4 cells" in capsys.readouterr().out
+    assert "8 of 8 cells" in capsys.readouterr().out
     assert read_table(tmp_path / "runs/sweeps/s/results.csv") == rows
     assert not (tmp_path / "runs/sweeps/s/cells").exists()
 

@@ -8,7 +8,7 @@ from actors.result_table import ResultRow
 from learner.sweep import SweepConfig, cell_hash, done_cells, make_cell, make_cells, other_worlds, wanted
 from sim_core.checks import ConfigError
 
-SMALL = SweepConfig(robots=(5, 10), groups=(1, 2), seeds=(0,), episodes=30, extrapolation_episodes=20)
+SMALL = SweepConfig(robots=(5, 10), groups=(1, 2), seeds=(0,), episodes=30, extrapolation_episodes=20, baselines=())
 
 
 def rows_of(sweep, cell):
@@ -38,7 +38,7 @@ def rows_of(sweep, cell):
 
 
 def test_the_dissertations_grid_has_75_setups_a_seed():
-    cells = make_cells(SweepConfig(seeds=(0, 1)))
+    cells = make_cells(SweepConfig(seeds=(0, 1), baselines=()))
     assert len(cells) == 150 and len({cell.key for cell in cells}) == 150
     setups = {(cell.config.world.method, cell.config.world.robots, cell.config.world.groups) for cell in cells}
     assert len(setups) == 75
@@ -79,6 +79,25 @@ def test_a_cells_key_tells_apart_all_that_decides_its_results():
 def test_the_length_of_the_training_takes_its_schedule_along():
     config = make_cell(dataclasses.replace(SMALL, env_steps=400_000), "out", 5, 1, 0).config
     assert config.total_env_steps == config.learning_rate_decay_env_steps == 400_000
+
+
+def test_baselines_are_played_in_the_world_of_every_cell():
+    sweep = dataclasses.replace(SMALL, baselines=("greedy", "fl-orca"), baseline_episodes=7)
+    cells = make_cells(sweep)
+    played, trained = cells[:-12], cells[-12:]
+    assert trained == make_cells(SMALL) and len({cell.key for cell in cells}) == len(cells) == 36
+    assert {cell.policy for cell in played} == {"greedy", "fl-orca"} and {cell.policy for cell in trained} == {
+        "learned"
+    }
+    for policy in ("greedy", "fl-orca"):
+        worlds = [cell.config.world for cell in played if cell.policy == policy]
+        assert sorted(worlds, key=str) == sorted((cell.config.world for cell in trained), key=str)
+    assert all(wanted(sweep, cell) == {(c.robots, c.groups): 7} for cell in played for c in [cell.config.world])
+    assert played[0].name == "greedy: sensor 5r×1g"
+    rows = [row._replace(policy=cell.policy) for cell in played for row in rows_of(sweep, cell)]
+    assert set(done_cells(sweep, cells, rows)) == {cell.key for cell in played}
+    learned = [row._replace(policy="learned") for row in rows]
+    assert not done_cells(sweep, cells, learned)
 
 
 def test_settings_take_the_place_of_the_presets():
@@ -147,6 +166,8 @@ def test_results_of_more_episodes_do_as_well():
         ({"episodes": 0}, "episodes must be at least 1"),
         ({"extrapolation_episodes": 0}, "extrapolation_episodes must be at least 1"),
         ({"env_steps": 0}, "env_steps must be at least 1"),
+        ({"baselines": ("swarm",)}, "baselines must be among fl-orca, greedy, random"),
+        ({"baseline_episodes": 0}, "baseline_episodes must be at least 1"),
         ({"first_seed": -1}, "first_seed must be in"),
         ({"first_seed": 2**32 - 5}, "first_seed must be in"),
         ({"preset": "ours"}, "preset must be one of: thesis, best"),

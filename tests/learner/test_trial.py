@@ -7,6 +7,7 @@ import mlflow
 import numpy as np
 import pytest
 
+from actors.baselines import Baseline
 from actors.evaluation_store import load_evaluation
 from actors.evaluator import evaluate
 from actors.result_table import read_table
@@ -89,6 +90,18 @@ def test_a_cells_table_counts_its_stored_episodes(store, cell, tmp_path):
     artifacts = {item.path for item in client.list_artifacts(runs[0].info.run_id)}
     assert artifacts == {"results.csv", "policy.safetensors"}
     assert not folder.checkpoints.exists()
+
+
+def test_a_baselines_cell_counts_its_episodes(store, cell, tmp_path):
+    cell = Cell("greedy-cell", cell.config, "greedy")
+    rows = read_table(run_cell(SWEEP, cell, SweepPlace(tmp_path, store, "cells"), crashing_at(0)))
+    played = evaluate(cell.config.env, Baseline.GREEDY, list(range(77, 77 + 40)))
+    assert [(row.policy, row.episodes, row.is_fixed) for row in rows] == [("greedy", 40, True)]
+    assert [rows[0].count(kind) for kind in ENDED] == [int((played.outcome == kind).sum()) for kind in ENDED]
+    runs = runs_of(store, cell)[1]
+    assert [run.info.status for run in runs] == ["FINISHED"]
+    assert runs[0].info.run_name == "greedy: sensor 3r×2g" and runs[0].data.tags["policy"] == "greedy"
+    assert runs[0].data.metrics["final/success_rate"] == rows[0].goal / 40
 
 
 def test_a_finished_cell_is_not_run_again(store, cell, tmp_path):
