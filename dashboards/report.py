@@ -12,19 +12,31 @@ from dashboards.diagrams import DIAGRAMS
 from dashboards.pooled import METHOD_NAMES, NUM_CELLS, SETUPS, Results, Setup, success
 from dashboards.result_figures import PICTURES
 
+BASELINES_NOTE = (
+    "`fl-orca` drives the learning robot as the rest of the swarm, with more knowledge than the method's state holds; "
+    "`greedy` heads for where the state shows the own group. Means over setups, from the same start scenes."
+)
+
 
 class PresetPart(NamedTuple):
-    """What the report says of one preset: its name, results, judged claims, and where its pictures lie."""
+    """What the report says of one preset: its name, results, judged claims, where its pictures lie, and baselines."""
 
     name: str
     results: Results
     claims: list[Claim]
     folder: str
+    baselines: dict[str, Results]
 
 
 def presets_of(rows: Sequence[ResultRow]) -> list[str]:
     """The presets with a learned policy in the table, by name; `thesis` first, since others are measured against it."""
     return sorted({row.preset for row in rows if row.policy == LEARNED}, key=lambda name: (name != "thesis", name))
+
+
+def baselines_of(rows: Sequence[ResultRow]) -> dict[str, Results]:
+    """The results of each baseline in the table, by its name."""
+    names = sorted({row.policy for row in rows} - {LEARNED})
+    return {name: Results(row._replace(policy=LEARNED) for row in rows if row.policy == name) for name in names}
 
 
 def report_markdown(source: str, parts: Sequence[PresetPart]) -> str:
@@ -37,7 +49,7 @@ def report_markdown(source: str, parts: Sequence[PresetPart]) -> str:
     lines = ["# Results", "", f"Made by `shoal report` from `{source}`.", ""]
     lines += [*_coverage(parts), ""]
     if len(parts) > 1:
-        lines += ["## Presets side by side", "", *comparison(parts), ""]
+        lines += ["## Presets side by side", "", *comparison({part.name: part.results for part in parts}), ""]
     lines += [NOTE, "", "Every check with its numbers: [claims.md](claims.md).", ""]
     for part in parts:
         lines += _preset_part(part)
@@ -64,29 +76,31 @@ def _coverage_row(part: PresetPart) -> tuple[str, ...]:
 
 def _preset_part(part: PresetPart) -> list[str]:
     lines = [f"## Preset {part.name}", "", f"### Claims: {tally(part.claims)}", "", *verdict_table(part.claims), ""]
+    if part.baselines:
+        lines += ["### Learned policies beside rules that learn nothing", "", BASELINES_NOTE, ""]
+        lines += [*comparison({"learned": part.results} | part.baselines), ""]
     lines += ["### Figures", ""]
     for picture in PICTURES:
         lines += [f"![{picture.alt}, preset {part.name}]({part.folder}{picture.file})", ""]
     return lines
 
 
-def comparison(parts: Sequence[PresetPart]) -> list[str]:
-    """Mean Fixed success of each preset over the setups that all have, a row a method; as lines.
+def comparison(rivals: dict[str, Results]) -> list[str]:
+    """Mean Fixed success of each rival over the setups that all have, a row a method; as lines.
 
-    `better in` counts the setups in which a preset has a higher rate than every other.
+    `best in` counts the setups in which a rival has a higher rate than every other.
     """
-    names = [part.name for part in parts]
-    header = ["method", "setups in all", *names, *(f"{name} better in" for name in names)]
-    return table_of(header, [_comparison_row(parts, method) for method in METHOD_NAMES])
+    header = ["method", "setups in all", *rivals, *(f"{name} best in" for name in rivals)]
+    return table_of(header, [_comparison_row(list(rivals.values()), method) for method in METHOD_NAMES])
 
 
-def _comparison_row(parts: Sequence[PresetPart], method: str) -> list[str]:
-    shared = [setup for setup in SETUPS if all(part.results.fixed(method, setup) is not None for part in parts)]
+def _comparison_row(rivals: list[Results], method: str) -> list[str]:
+    shared = [setup for setup in SETUPS if all(results.fixed(method, setup) is not None for results in rivals)]
     if not shared:
-        return [METHOD_NAMES[method], "0", *["–"] * (2 * len(parts))]
-    rates = [[_success(part.results, method, setup) for setup in shared] for part in parts]
+        return [METHOD_NAMES[method], "0", *["–"] * (2 * len(rivals))]
+    rates = [[_success(results, method, setup) for setup in shared] for results in rivals]
     means = [f"{100 * sum(line) / len(line):.1f} %" for line in rates]
-    wins = [0] * len(parts)
+    wins = [0] * len(rivals)
     for column in zip(*rates, strict=True):
         best = max(column)
         if column.count(best) == 1:

@@ -15,14 +15,14 @@ from dashboards.claims import judge
 from dashboards.diagrams import DIAGRAMS
 from dashboards.pictures import save_png
 from dashboards.pooled import Results
-from dashboards.report import PresetPart, presets_of, report_markdown
+from dashboards.report import PresetPart, baselines_of, presets_of, report_markdown
 from dashboards.result_figures import PICTURES
 from sim_core.checks import require
 
 if TYPE_CHECKING:
     from deploy.options import Report
 
-PRESET_NAME = re.compile(r"\w[\w.-]*")
+PRESET_NAME = re.compile(r"\w[\w.+=,\[\] -]*")
 """What a preset may be called: it names a folder where there are several."""
 
 
@@ -38,10 +38,11 @@ def report(command: Report) -> int:
     parts = []
     for preset in presets:
         good = PRESET_NAME.fullmatch(preset) is not None
-        require(good, f"{command.results} names a preset {preset!r}; letters, digits, '.', '_' and '-' can be used")
-        results = Results(row for row in rows if row.preset == preset)
+        require(good, f"{command.results} names a preset {preset!r}, which cannot name a folder")
+        own = [row for row in rows if row.preset == preset]
         folder = f"{preset}/" if len(presets) > 1 else ""
-        parts.append(PresetPart(preset, results, judge(results), folder))
+        results = Results(own)
+        parts.append(PresetPart(preset, results, judge(results), folder, baselines_of(own)))
     _write(command.out, command.results.name, parts)
     for part in parts:
         Console().print(f"{part.name}: {tally(part.claims)}", highlight=False)

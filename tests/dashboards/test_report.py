@@ -9,14 +9,14 @@ from actors.result_table import ResultRow
 from dashboards.claims import judge
 from dashboards.diagrams import DIAGRAMS
 from dashboards.pooled import Results, Setup
-from dashboards.report import PresetPart, comparison, presets_of, report_markdown
+from dashboards.report import PresetPart, baselines_of, comparison, presets_of, report_markdown
 from dashboards.result_figures import PICTURES
 from tests.dashboards.tables import claimed_table, fixed, row
 
 
 def part(name: str, rows: Sequence[ResultRow], folder: str = "") -> PresetPart:
     results = Results(rows)
-    return PresetPart(name, results, judge(results), folder)
+    return PresetPart(name, results, judge(results), folder, baselines_of(rows))
 
 
 def test_presets_are_those_with_a_policy_and_thesis_comes_first():
@@ -51,8 +51,8 @@ def test_presets_are_compared_where_all_have_a_cell():
     first.append(row("out", small, success=70))
     second = [row("sensor", setup, success=share) for setup, share in ((small, 95), (middle, 60))]
     second.append(row("in", small, success=70))
-    lines = comparison([part("thesis", first), part("best", second)])
-    assert lines[0] == "| method | setups in all | thesis | best | thesis better in | best better in |"
+    lines = comparison({"thesis": Results(first), "best": Results(second)})
+    assert lines[0] == "| method | setups in all | thesis | best | thesis best in | best best in |"
     assert lines[2:] == [
         "| M_sensor | 2 | 85.0 % | 77.5 % | 1 | 1 |",
         "| M_IN | 0 | – | – | – | – |",
@@ -62,4 +62,16 @@ def test_presets_are_compared_where_all_have_a_cell():
 
 def test_a_tie_is_nobodys():
     rows = [row("out", Setup(5, 1), success=70)]
-    assert "| M_OUT | 1 | 70.0 % | 70.0 % | 0 | 0 |" in comparison([part("a", rows), part("b", rows)])
+    assert "| M_OUT | 1 | 70.0 % | 70.0 % | 0 | 0 |" in comparison({"a": Results(rows), "b": Results(rows)})
+
+
+def test_baselines_stand_beside_the_learned_policies_of_the_same_setups():
+    learned = [row("sensor", Setup(5, 1), success=90), row("sensor", Setup(10, 2), success=80)]
+    greedy = [
+        row("sensor", Setup(5, 1), success=95)._replace(policy="greedy"),
+        row("sensor", Setup(25, 8), success=5)._replace(policy="greedy"),
+    ]
+    page = report_markdown("r.csv", [part("thesis", [*learned, *greedy])])
+    assert "| method | setups in all | learned | greedy | learned best in | greedy best in |" in page
+    assert "| M_sensor | 1 | 90.0 % | 95.0 % | 0 | 1 |" in page
+    assert "rules that learn nothing" not in report_markdown("r.csv", [part("thesis", learned)])
