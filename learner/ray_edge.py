@@ -94,7 +94,8 @@ def cpus_needed(config: RunConfig) -> int:
     return config.workers + shards + 1
 
 
-def _cluster_cpus() -> int:
+def cluster_cpus() -> int:
+    """CPU slots of the cluster that this process has joined."""
     return int(ray.cluster_resources().get("CPU", 0))
 
 
@@ -113,7 +114,7 @@ def connect(cpus: int, address: str | None) -> None:
         ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
     except ConnectionError as error:
         raise ConfigError(f"no Ray cluster answers at {address!r}; start one with `ray start --head`") from error
-    have = _cluster_cpus()
+    have = cluster_cpus()
     if have < cpus:
         ray.shutdown()
         raise ConfigError(
@@ -131,7 +132,7 @@ def evaluate_in_tasks(spec: EnvSpec, candidate: Candidate, seeds: list[int], add
     connect(1, address)
     calls = RayCalls()
     try:
-        return evaluate_in_parts(calls, spec, calls.put(candidate), seeds, _cluster_cpus())
+        return evaluate_in_parts(calls, spec, calls.put(candidate), seeds, cluster_cpus())
     finally:
         ray.shutdown()
 
@@ -159,6 +160,6 @@ def ray_cluster(config: RunConfig, incarnation: int, address: str | None) -> Clu
         collects_in_flight=COLLECTS_IN_FLIGHT,
         blocks_in_flight=config.workers * (COLLECTS_IN_FLIGHT + PUSHES_IN_FLIGHT),
         updates_in_flight=UPDATES_IN_FLIGHT,
-        eval_tasks=_cluster_cpus(),
+        eval_tasks=cluster_cpus(),
         close=ray.shutdown,
     )

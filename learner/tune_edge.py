@@ -16,7 +16,7 @@ import ray
 from ray import tune
 
 from learner.journal import Row
-from learner.ray_edge import connect
+from learner.ray_edge import cluster_cpus, connect
 from learner.sweep import Cell, SweepConfig
 from learner.trial import SweepPlace, run_cell
 
@@ -119,6 +119,7 @@ def run_cells(
     """
     connect(1, address)
     known = {cell.key: cell for cell in cells}
+    at_once = at_once or cluster_cpus()  # without a limit Tune would take the cells in no order
     trainable = tune.with_parameters(_train_cell, sweep=sweep, cells=known, place=place)
     with tempfile.TemporaryDirectory(prefix="shoal-tune-") as folder:
         tuner = tune.Tuner(
