@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 
 from rich.console import Console
@@ -91,7 +92,7 @@ def sweep(command: Sweep) -> int:
     folder = (launch.runs_dir / "sweeps" / name).absolute()
     results = SweepResults(command.grid, folder, read_table(command.known) if command.known else [])
     make_folder(folder)
-    console = Console()
+    console = Console(file=sys.stdout)  # by name: Tune's own output is kept from sys.stdout while it runs
     console.print(f"sweep {folder}", highlight=False, soft_wrap=True)
     done = results.write()
     board = make_board(console, results.cells, done)

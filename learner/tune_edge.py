@@ -6,9 +6,11 @@ missing, since Tune cannot change a grid that it restores.
 
 from __future__ import annotations
 
+import io
 import os
 import tempfile
 import time
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -22,12 +24,13 @@ from learner.trial import SweepPlace, run_cell
 
 ATTEMPTS = 3
 """How often a cell is started before it counts as failed."""
+TRACE = "error.txt"
+"""In a failed cell's folder: the trace of its last crash."""
 REPORT_EVERY_S = 2.0
 """Least time between two reports of a cell."""
 
 os.environ.setdefault("TUNE_DISABLE_AUTO_CALLBACK_LOGGERS", "1")  # cells write their own results
 os.environ.setdefault("TUNE_DISABLE_SIGINT_HANDLER", "1")  # Ctrl-C ends a sweep at once; it can go on at any time
-os.environ.setdefault("RAY_AIR_NEW_OUTPUT", "0")  # with verbose=0 Tune is silent: the board is ours
 
 
 class CellListener(Protocol):
@@ -69,10 +72,11 @@ def _train_cell(params: dict[str, Any], sweep: SweepConfig, cells: dict[str, Cel
 
 
 class _Callback(tune.Callback):
-    """Translates Tune's events to a CellListener."""
+    """Translates Tune's events to a CellListener, and keeps the trace of a cell's last crash in its folder."""
 
-    def __init__(self, listener: CellListener) -> None:
+    def __init__(self, listener: CellListener, place: SweepPlace) -> None:
         self._listener = listener
+        self._place = place
 
     def __getstate__(self) -> dict[str, Any]:
         """Nothing: Tune saves its experiment with its callbacks, which here is never restored."""
@@ -91,9 +95,14 @@ class _Callback(tune.Callback):
         self._listener.finished(trial.config["cell"])
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        if trial.status == "ERROR":
-            lines = [line for line in str(trial.get_error() or "").splitlines() if line.strip()]
-            self._listener.failed(trial.config["cell"], lines[-1] if lines else "it crashed")
+        if trial.status != "ERROR":
+            return
+        key, trace = trial.config["cell"], str(trial.get_error() or "its process died")
+        path = self._place.cells / key / TRACE
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(trace + "\n")
+        lines = [line for line in trace.splitlines() if line.strip()]
+        self._listener.failed(key, f"{lines[-1]} (trace in {path})")
 
 
 def run_cells(
@@ -130,9 +139,10 @@ def run_cells(
                 name="cells",
                 storage_path=str(Path(folder)),
                 failure_config=tune.FailureConfig(max_failures=ATTEMPTS - 1),
-                callbacks=[_Callback(listener)],
+                callbacks=[_Callback(listener, place)],
                 verbose=0,
             ),
         )
-        tuner.fit()
+        with redirect_stdout(io.StringIO()):  # the listener tells what Tune would print
+            tuner.fit()
     ray.shutdown()

@@ -8,6 +8,7 @@ from deploy.cli import main
 from learner.sweep import SweepConfig, make_cells
 from learner.tracker import Tracker
 from learner.trial import SweepPlace, run_cell
+from learner.tune_edge import run_cells
 from tests.integration.jobs import Job
 
 pytestmark = [
@@ -91,3 +92,38 @@ def test_what_cannot_be_is_refused_before_anything_runs(capsys, tmp_path, monkey
     assert main(["sweep", *arguments]) == 2
     assert words in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+class Told:
+    """Remembers what it is told; implements `learner.tune_edge.CellListener`."""
+
+    def __init__(self):
+        self.events = []
+
+    def started(self, key):
+        self.events.append(("started", key))
+
+    def progressed(self, key, env_steps):
+        self.events.append(("progressed", key))
+
+    def finished(self, key):
+        self.events.append(("finished", key))
+
+    def failed(self, key, reason):
+        self.events.append(("failed", key, reason))
+
+
+def test_a_cell_that_crashes_fails_with_its_reason_and_the_others_go_on(capsys, tmp_path):
+    uri = f"sqlite:///{tmp_path / 'mlflow.db'}"
+    Tracker(uri, "cells", str(tmp_path / "artifacts"))
+    good, bad = make_cells(SWEEP)[:2]
+    told = Told()
+    (tmp_path / "cells" / bad.key / "artifacts" / "results.csv.part").mkdir(parents=True)  # where a file is written
+    run_cells(SWEEP, [bad, good], SweepPlace(tmp_path / "cells", uri, "cells"), None, 1, told)
+    last = {event[1]: event for event in told.events}
+    assert last[good.key] == ("finished", good.key)
+    assert last[bad.key][0] == "failed" and "IsADirectoryError" in last[bad.key][2]
+    assert [event[0] for event in told.events].count("failed") == 1
+    trace = (tmp_path / "cells" / bad.key / "error.txt").read_text()
+    assert "in run_cell" in trace and "IsADirectoryError" in trace
+    assert "Trial" not in capsys.readouterr().out
