@@ -1,11 +1,15 @@
 """Named settings of a training: `thesis`, the reading closest to the dissertation's text, and `best`, ours.
 
 `thesis` takes what the text says: one-step updates (Algorithms 1 and 2), epsilon 0.05, learning rate 0.001, the
-numbers of Tables 3.2 and 4.2. It says nothing of how long and how often to update, nor how exploration begins: those
-are calibrated on seeds that no evaluation uses (README of `sim_core`, open questions). So are two numbers of ORCA:
-with 10 neighbours and 0.2 m large swarms jam, and FL-ORCA itself in the learning robot's place reaches the goal in
-19 % of episodes of 25r×8g (`shoal evaluate fl-orca`). For M_IN and M_OUT all robots of a group span its ellipse, as the
-text has it, and the sum u_nn + u_apf may be twice as fast as u_nn, since the text bounds neither.
+numbers of Tables 3.2 and 4.2. It says nothing of how long and how often to update, nor how exploration begins, nor of
+the robots' size: those are calibrated on seeds that no evaluation uses (README of `sim_core`, open questions).
+
+- ORCA: with 10 neighbours and 0.2 m large swarms jam, and FL-ORCA itself in the learning robot's place hardly reaches the
+  goal of 25r×8g within the horizon.
+- The robots' radius: 0.06 m leaves room between swarm robots that do not avoid the learning robot. With 0.1 m it collides
+  in M_OUT whatever the field does.
+- M_IN and M_OUT: all robots of a group span its ellipse, as the text has it; the sum u_nn + u_apf may be faster than
+  u_nn, as the text bounds neither.
 
 `best` keeps state, actions, reward and worlds of each method and changes only how it is learned.
 """
@@ -37,8 +41,8 @@ _TRAINING: dict[tuple[PresetName, MethodName], dict[str, Any]] = {
     ("best", "in"): {"n_step": 3, "samples_per_insert": 4.0},
     ("best", "out"): {"n_step": 3, "samples_per_insert": 4.0},
 }
-_SWARM: dict[str, Any] = {"max_neighbours": 16, "orca_radius_m": 0.18}
-_ELLIPSES: dict[str, Any] = {**_SWARM, "ellipse_counts_learner": True, "learner_speed_limit_m_s": 2.0}
+_SWARM: dict[str, Any] = {"max_neighbours": 16, "orca_radius_m": 0.18, "robot_radius_m": 0.06}
+_ELLIPSES: dict[str, Any] = {**_SWARM, "ellipse_counts_learner": True, "learner_speed_limit_m_s": 1.5}
 _WORLD: dict[MethodName, dict[str, Any]] = {"sensor": _SWARM, "in": _ELLIPSES, "out": _ELLIPSES}
 
 
