@@ -7,7 +7,7 @@ import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast, get_args
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # before numpy: one thread a process, or processes fight for cores
@@ -16,7 +16,8 @@ import tyro  # noqa: E402
 
 from deploy.options import Command, Evaluate, Report, Resume, Sweep, Train, Watch  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
-from sim_core.checks import ConfigError  # noqa: E402
+from learner.presets import MethodName, PresetName, preset_config  # noqa: E402
+from sim_core.checks import ConfigError, require  # noqa: E402
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -37,14 +38,29 @@ def read_config_file(path: Path) -> RunConfig:
     return from_dict(values)
 
 
-def _config_argument(arguments: Sequence[str]) -> Path | None:
-    """The file after `--config`, which is needed before the rest is parsed: its values are the defaults."""
+def _value_of(flag: str, arguments: Sequence[str]) -> str | None:
+    """What follows `flag`, for flags that are needed before the rest is parsed."""
     for i, argument in enumerate(arguments):
-        if argument == "--config" and i + 1 < len(arguments):
-            return Path(arguments[i + 1])
-        if argument.startswith("--config="):
-            return Path(argument.removeprefix("--config="))
+        if argument == flag and i + 1 < len(arguments):
+            return arguments[i + 1]
+        if argument.startswith(f"{flag}="):
+            return argument.removeprefix(f"{flag}=")
     return None
+
+
+def _train_defaults(arguments: Sequence[str]) -> Train:
+    """What `shoal train` starts from: the defaults, or the values of a `--config` or a `--preset`.
+
+    Raises:
+      ConfigError: the config's file cannot be read or holds what cannot work, or a preset is named beside it.
+    """
+    path, preset, method = (_value_of(flag, arguments) for flag in ("--config", "--preset", "--method"))
+    if path is not None:
+        require(preset is None, "--config and --preset both give all settings; leave one of them out")
+        return Train(config=Path(path), run=read_config_file(Path(path)))
+    if preset in get_args(PresetName) and (method or "sensor") in get_args(MethodName):  # else tyro tells the choices
+        return Train(run=preset_config(cast(PresetName, preset), cast(MethodName, method or "sensor")))
+    return Train()
 
 
 def parse(arguments: Sequence[str]) -> Command:
@@ -54,8 +70,7 @@ def parse(arguments: Sequence[str]) -> Command:
       ConfigError: a value cannot work.
       SystemExit: help was asked for (0), or a flag is unknown or malformed (2, after a message).
     """
-    path = _config_argument(arguments)
-    default = Train(config=path, run=read_config_file(path)) if path else Train()
+    default = _train_defaults(arguments) if arguments and arguments[0] == "train" else Train()
     commands: Any = (
         Annotated[Train, tyro.conf.subcommand("train", default=default)]
         | Annotated[Sweep, tyro.conf.subcommand("sweep")]

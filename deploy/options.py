@@ -10,6 +10,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from learner.config import RunConfig
+from learner.presets import PresetName
 from learner.sweep import SweepConfig
 from sim_core.checks import require
 
@@ -58,6 +59,8 @@ class Train:
 
     config: Path | None = None
     """TOML file with settings; flags override it. World settings stand under [world]."""
+    preset: PresetName | None = None
+    """Named settings of --method in place of the defaults, those of `shoal sweep`; flags override them."""
     run: RunConfig = field(default_factory=RunConfig)
     """What to learn."""
     launch: Launch = field(default_factory=Launch)
@@ -117,6 +120,8 @@ class Evaluate:
     """Seed of the first episode; the others count on."""
     method: Literal["sensor", "in", "out"] | None = None
     """Baselines only: method of the world to play in; sensor by default."""
+    preset: PresetName | None = None
+    """Baselines only: settings of the world to play in, those of `shoal sweep`; the defaults otherwise."""
     robots: int | None = None
     """Robots per group; by default those of the training (others: Extrapolation), or 10 for a baseline."""
     groups: int | None = None

@@ -23,6 +23,7 @@ from deploy.tables import evaluation_table
 from learner.checkpoint import newest_valid
 from learner.config import RunConfig
 from learner.policy_file import read_policy, read_saved_policy
+from learner.presets import preset_config
 from learner.ray_edge import evaluate_in_tasks
 from learner.results import summarise
 from learner.run_folder import RunFolder, find_run
@@ -71,16 +72,19 @@ def evaluate(command: Evaluate) -> int:
 
 def _baseline_entry(command: Evaluate) -> Entry:
     baseline = Baseline(command.run)
-    world = _on_setup(WorldConfig(method=command.method or WorldConfig.method), command)
+    method = command.method or "sensor"
+    default = preset_config(command.preset, method).world if command.preset else WorldConfig(method=method)
+    world = _on_setup(default, command)
     title = f"{baseline}, {world.method} {world.setup}"
     return Entry(EnvSpec(ENV_ID, world), baseline, str(baseline), 0, title)
 
 
 def _run_entry(command: Evaluate) -> Entry:
-    require(
-        command.method is None,
-        f"--method is for the baselines {', '.join(Baseline)}; the run {command.run!r} has a method of its own",
-    )
+    for name in ("method", "preset"):
+        require(
+            getattr(command, name) is None,
+            f"--{name} is for the baselines {', '.join(Baseline)}; the run {command.run!r} has a {name} of its own",
+        )
     folder = find_run(command.run, command.runs_dir)
     config = folder.config()
     resized = command.robots is not None or command.groups is not None

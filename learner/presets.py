@@ -4,10 +4,10 @@
 numbers of Tables 3.2 and 4.2. It says nothing of how long and how often to update, nor how exploration begins, nor of
 the robots' size: those are calibrated on seeds that no evaluation uses (README of `sim_core`, open questions).
 
-- ORCA: with 10 neighbours and 0.2 m large swarms jam, and FL-ORCA itself in the learning robot's place hardly reaches the
-  goal of 25r×8g within the horizon.
-- The robots' radius: 0.06 m leaves room between swarm robots that do not avoid the learning robot. With 0.1 m it collides
-  in M_OUT whatever the field does.
+- ORCA: with 10 neighbours and 0.2 m large swarms jam, and FL-ORCA itself in the learning robot's place hardly reaches
+  the goal of 25r×8g within the horizon.
+- The robots' radius: 0.06 m leaves room between swarm robots that do not avoid the learning robot. With 0.1 m it
+  collides in M_OUT whatever the field does.
 - M_IN and M_OUT: all robots of a group span its ellipse, as the text has it; the sum u_nn + u_apf may be faster than
   u_nn, as the text bounds neither.
 
@@ -46,7 +46,7 @@ _ELLIPSES: dict[str, Any] = {**_SWARM, "ellipse_counts_learner": True, "learner_
 _WORLD: dict[MethodName, dict[str, Any]] = {"sensor": _SWARM, "in": _ELLIPSES, "out": _ELLIPSES}
 
 
-def preset_config(name: PresetName, method: MethodName, robots: int, groups: int) -> RunConfig:
+def preset_config(name: PresetName, method: MethodName, robots: int = 10, groups: int = 2) -> RunConfig:
     """The settings that a preset gives one method in one setup.
 
     Raises:

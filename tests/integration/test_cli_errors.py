@@ -1,5 +1,6 @@
 """Bad input on the command line: exit code 2, a sentence that says what and how to mend it, no traceback."""
 
+import dataclasses
 import json
 import shutil
 import socket
@@ -7,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from deploy.cli import main
+from deploy.cli import main, parse
+from learner.presets import preset_config
 from tests.integration.conftest import SMALL, flags
 
 
@@ -45,6 +47,8 @@ def free_port() -> int:
         (["--env-id", "Pendulum-v1"], ["env_id", "Discrete"]),
         (["--name", "../up"], ["--name", "plain folder name"]),
         (["--config", "missing.toml"], ["--config", "missing.toml", "cannot be read"]),
+        (["--config", "missing.toml", "--preset", "best"], ["--config", "--preset", "leave one"]),
+        (["--preset", "ours"], ["--preset", "thesis", "best"]),
         (["--runs-dir", "/proc/nothing"], ["--runs-dir", "write"]),
     ],
 )
@@ -81,9 +85,15 @@ def test_train_refuses_a_config_file(capsys, tmp_path, monkeypatch, text, words)
         assert word in error
 
 
-def test_a_config_file_gives_the_defaults_and_flags_override_them(tmp_path):
-    from deploy.cli import parse
+@pytest.mark.parametrize("method", ["sensor", "in", "out"])
+def test_a_preset_gives_the_defaults_and_flags_override_them(method):
+    command = parse(["train", "--preset", "thesis", "--method", method, "--robots", "7", "--n-step", "2"])
+    expected = preset_config("thesis", method, 7, 2)
+    assert command.run == dataclasses.replace(expected, n_step=2) and expected.n_step == 1
+    assert parse(["train", "--preset=best"]).run == preset_config("best", "sensor")
 
+
+def test_a_config_file_gives_the_defaults_and_flags_override_them(tmp_path):
     (tmp_path / "run.toml").write_text("batch_size = 64\nhidden_sizes = [32, 16]\n[world]\nrobots = 5\ngroups = 3\n")
     command = parse(["train", "--config", str(tmp_path / "run.toml"), "--robots", "7"])
     assert (command.run.batch_size, command.run.hidden_sizes) == (64, (32, 16))

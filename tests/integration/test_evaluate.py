@@ -19,6 +19,7 @@ from deploy import playing
 from deploy.cli import main
 from deploy.playing import episodes_path
 from learner.policy_file import save_policy
+from learner.presets import preset_config
 from learner.run_folder import RunFolder
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig
@@ -68,6 +69,12 @@ def test_a_baseline_is_stored_as_it_was_played(capsys, folder, baseline, method)
     assert_same_stats(stored.stats, evaluate(spec, baseline, seeds))
 
 
+def test_a_baseline_plays_in_a_presets_world(folder):
+    arguments = ["--preset", "thesis", "--method", "out", "--robots", "5", "--episodes", "4", "--out", "e.zarr"]
+    assert main(["evaluate", "greedy", *arguments]) == 0
+    assert load_evaluation(folder / "e.zarr").spec.world == preset_config("thesis", "out", 5, 2).world
+
+
 def test_a_baseline_plays_the_dissertations_setup_by_default(capsys):
     assert main(["evaluate", "random", "--episodes", "2"]) == 0
     assert "random, sensor 10r×2g: 2 episodes" in capsys.readouterr().out
@@ -107,6 +114,7 @@ def test_a_baselines_name_is_taken_and_a_run_of_that_name_is_named_as_a_folder(c
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (["r", "--preset", "best"], ["--preset", "'r' has a preset of its own"]),
         (["r", "--method", "in"], ["--method", "fl-orca, greedy, random", "'r' has a method of its own"]),
         (["greedy", "--method", "touch"], ["--method", "touch"]),
         (["greedy", "--robots", "1"], ["robots", "at least 2"]),
