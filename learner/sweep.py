@@ -131,9 +131,15 @@ class Cell(NamedTuple):
 
 
 def cell_hash(config: RunConfig) -> str:
-    """Twelve hex digits of all that decides a cell's results; unlike `config_hash`, the training's length counts."""
-    values = to_dict(config)
-    values.pop("engine")
+    """Twelve hex digits of all that decides a cell's results; unlike `config_hash`, the training's length counts.
+
+    Only what differs from the defaults goes in, so that results stay known when a later version has more settings.
+    """
+    defaults = to_dict(RunConfig())
+    world = {name: value for name, value in to_dict(config)["world"].items() if value != defaults["world"][name]}
+    run = {name: value for name, value in to_dict(config).items() if value != defaults[name]}
+    values = {**run, "world": world}
+    values.pop("engine", None)
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 
 from actors.result_table import ResultRow
+from learner.config import to_dict
 from learner.sweep import SweepConfig, cell_hash, done_cells, make_cell, make_cells, other_worlds, wanted
 from sim_core.checks import ConfigError
 
@@ -74,6 +75,20 @@ def test_a_cells_key_tells_apart_all_that_decides_its_results():
     ]
     assert len({cell_hash(cell.config) for cell in [base, *others]}) == 7
     assert cell_hash(dataclasses.replace(base.config, engine="ray")) == cell_hash(base.config)
+
+
+def test_a_setting_that_is_as_by_default_does_not_count(monkeypatch):
+    config = make_cell(SMALL, "out", 5, 2, 0).config
+    before = cell_hash(config)
+    plain = to_dict
+
+    def with_more(some):  # a later version, whose run and world have a setting more
+        values = plain(some)
+        return {**values, "later": 3, "world": {**values["world"], "later_m": 0.5}}
+
+    monkeypatch.setattr("learner.sweep.to_dict", with_more)
+    assert cell_hash(config) == before
+    assert cell_hash(dataclasses.replace(config, n_step=4)) != before
 
 
 def test_the_length_of_the_training_takes_its_schedule_along():
