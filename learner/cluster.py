@@ -44,6 +44,7 @@ def learner_settings(config: RunConfig, shape: EnvShape) -> LearnerSettings:
         batch_size=config.batch_size,
         target_update_interval=config.target_update_interval,
         max_gradient_norm=config.max_gradient_norm,
+        gradients=config.gradients,
         seed=config.seed,
     )
 

@@ -86,6 +86,8 @@ class RunConfig:
     """Updates between two copies of the online to the target network (C)."""
     max_gradient_norm: float = 10.0
     """Gradients are scaled down to this norm."""
+    gradients: Literal["by_hand", "autograd"] = "by_hand"
+    """Gradients of the update written out, or by PyTorch's autograd: the same to rounding, by hand faster."""
 
     eval_every_env_steps: int = 250_000
     """Env steps between two evaluations during training."""

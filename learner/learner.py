@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -11,7 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from actors.network import QNetwork, WeightsSnapshot, snapshot
-from learner.double_dqn import as_batch, huber_loss, targets
+from learner.double_dqn import as_batch
+from learner.gradients import GRADIENTS, FlatNetwork
 
 
 class LearnerSettings(NamedTuple):
@@ -24,6 +24,7 @@ class LearnerSettings(NamedTuple):
     batch_size: int
     target_update_interval: int
     max_gradient_norm: float
+    gradients: Literal["by_hand", "autograd"]
     seed: int
 
 
@@ -46,16 +47,19 @@ class Learner:
         self._settings = settings
         with torch.random.fork_rng():
             torch.manual_seed(settings.seed)
-            self.online = QNetwork(settings.observation_size, settings.hidden_sizes, settings.num_actions)
-        self.target = copy.deepcopy(self.online)
-        self.optimiser = torch.optim.Adam(self.online.parameters(), fused=True)
+            online = QNetwork(settings.observation_size, settings.hidden_sizes, settings.num_actions)
+        self._online = FlatNetwork(online)
+        self._target = self._online.copy()
+        self.online, self.target = self._online.network, self._target.network
+        self._gradients = GRADIENTS[settings.gradients](self._online, self._target, settings.double)
+        self.optimiser = torch.optim.Adam([self._online.values], fused=True)
         self.updates = 0
 
     def update(self, rows: NDArray[Any], learning_rate: float) -> UpdateStats:
         """One update per `batch_size` rows of `rows`, a whole multiple of it."""
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate
-        columns = _tensors(rows)
+        columns = column_tensors(rows)
         size = self._settings.batch_size
         sums = torch.zeros(3)
         starts = range(0, len(rows), size)
@@ -65,18 +69,13 @@ class Learner:
         return UpdateStats(loss, q_mean, td_error)
 
     def _step(self, columns: dict[str, Tensor], part: slice) -> Tensor:
-        batch = as_batch(columns, part)
-        target = targets(batch, self.online, self.target, self._settings.double)
-        q_tm1 = self.online(batch.s_tm1)
-        loss, td_error = huber_loss(q_tm1, batch.a_tm1, target)
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(self.online.parameters(), self._settings.max_gradient_norm)
+        measured = self._gradients(as_batch(columns, part))
+        torch.nn.utils.clip_grad_norm_([self._online.values], self._settings.max_gradient_norm)
         self.optimiser.step()
         self.updates += 1
         if self.updates % self._settings.target_update_interval == 0:
-            self.target.load_state_dict(self.online.state_dict())
-        return torch.stack([loss.detach(), q_tm1.detach().mean(), td_error.abs().mean()])
+            self._target.values.data.copy_(self._online.values.data)
+        return torch.stack(measured)
 
     def weights(self, time_s: float) -> WeightsSnapshot:
         """The online network, for publication."""
@@ -86,9 +85,8 @@ class Learner:
         """All tensors that a checkpoint needs, by name."""
         state = {f"online.{name}": tensor for name, tensor in self.online.state_dict().items()}
         state |= {f"target.{name}": tensor for name, tensor in self.target.state_dict().items()}
-        for i, parameter in enumerate(self.online.parameters()):
-            for name, tensor in self.optimiser.state.get(parameter, {}).items():
-                state[f"optimiser.{i}.{name}"] = tensor
+        for name, tensor in self.optimiser.state.get(self._online.values, {}).items():
+            state[f"optimiser.{name}"] = tensor
         state["updates"] = torch.tensor(self.updates)
         return {name: tensor.detach().clone().contiguous() for name, tensor in state.items()}
 
@@ -103,10 +101,8 @@ class Learner:
             self.target.load_state_dict(_part(state, "target."))
         except RuntimeError as error:
             raise ValueError(f"the saved networks have another shape: {str(error).splitlines()[-1].strip()}") from error
-        saved: dict[int, Any] = {}
-        for name, tensor in _part(state, "optimiser.").items():
-            index, key = name.split(".")
-            saved.setdefault(int(index), {})[key] = tensor
+        adam = _part(state, "optimiser.")
+        saved = {0: adam} if adam else {}
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": saved, "param_groups": groups})
         self.updates = int(state["updates"])
@@ -116,7 +112,7 @@ def _part(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
 
 
-def _tensors(rows: NDArray[Any]) -> dict[str, Tensor]:
+def column_tensors(rows: NDArray[Any]) -> dict[str, Tensor]:
     """Columns of packed rows as tensors: observations and rewards float32, actions int64."""
     columns = {name: torch.from_numpy(rows[name].astype(np.float32)) for name in ("reward", "discount")}
     columns["action"] = torch.from_numpy(rows["action"].astype(np.int64))

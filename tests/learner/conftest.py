@@ -47,6 +47,7 @@ def learner_settings():
         batch_size=16,
         target_update_interval=3,
         max_gradient_norm=0.25,
+        gradients="by_hand",
         seed=5,
     )
 

@@ -40,9 +40,10 @@ def assert_same(network, other, **tolerance):
         np.testing.assert_allclose(tensor.numpy(), expected.numpy(), err_msg=name, **tolerance)
 
 
+@pytest.mark.parametrize("gradients", ["by_hand", "autograd"])
 @pytest.mark.parametrize("double", [True, False])
-def test_updates_equal_hand_written_ones(learner_settings, make_rows, double):
-    settings = learner_settings._replace(double=double, target_update_interval=2)
+def test_updates_equal_those_of_a_plain_loop(learner_settings, make_rows, double, gradients):
+    settings = learner_settings._replace(double=double, target_update_interval=2, gradients=gradients)
     learner = Learner(settings)
     online, target = copy.deepcopy(learner.online), copy.deepcopy(learner.target)
     optimiser = torch.optim.Adam(online.parameters(), lr=RATE, fused=False)
@@ -159,7 +160,7 @@ def one_hot_rows(steps, num_states):
 
 def train(rows, num_states, num_actions, double, updates):
     """Action values `[states, actions]` after updates over the whole of `rows` each."""
-    learner = Learner(LearnerSettings(num_states, num_actions, (32,), double, len(rows), 25, 10.0, 0))
+    learner = Learner(LearnerSettings(num_states, num_actions, (32,), double, len(rows), 25, 10.0, "by_hand", 0))
     for start in range(0, updates, 50):
         learner.update(np.tile(rows, 50), 1e-2 * (1 - start / updates) + 1e-4)
     return Policy(learner.weights(0.0)).values(np.eye(num_states))

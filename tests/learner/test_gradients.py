@@ -1,0 +1,84 @@
+"""Gradients written by hand are autograd's, whatever the network's shape, and flat parameters are the network's own."""
+
+import numpy as np
+import pytest
+import torch
+
+from actors.network import QNetwork
+from learner.double_dqn import Batch
+from learner.gradients import AutogradGradients, FlatNetwork, HandWrittenGradients
+
+
+def networks(observation_size, hidden_sizes, num_actions, seed=0):
+    torch.manual_seed(seed)
+    return [FlatNetwork(QNetwork(observation_size, hidden_sizes, num_actions)) for _ in range(2)]
+
+
+def random_batch(size, shape, num_actions, seed=0):
+    rng = np.random.default_rng(seed)
+
+    def tensor(array):
+        return torch.from_numpy(array.astype(np.float32))
+
+    return Batch(
+        s_tm1=tensor(rng.normal(size=(size, *shape))),
+        a_tm1=torch.from_numpy(rng.integers(num_actions, size=size)),
+        r_t=tensor(rng.normal(scale=2, size=size)),  # TD errors on both sides of Huber's corner
+        discount_t=tensor(rng.choice([0.0, 0.97], size=size)),
+        s_t=tensor(rng.normal(size=(size, *shape))),
+    )
+
+
+@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize(
+    ("shape", "hidden_sizes", "num_actions", "size"),
+    [((16,), (128, 128), 8, 256), ((72,), (256, 256), 9, 64), ((3,), (5,), 2, 1), ((2, 4), (7, 6, 5), 4, 33)],
+)
+def test_by_hand_is_autograd(double, shape, hidden_sizes, num_actions, size):
+    online, target = networks(int(np.prod(shape)), hidden_sizes, num_actions)
+    batch = random_batch(size, shape, num_actions)
+    found = HandWrittenGradients(online, target, double)(batch)
+    by_hand = online.values.grad.clone()
+    online.values.grad.fill_(torch.nan)  # what is left of it would show
+    expected = AutogradGradients(online, target, double)(batch)
+    assert float(by_hand.abs().max()) > 1e-3
+    scale = float(online.values.grad.abs().max())
+    torch.testing.assert_close(by_hand, online.values.grad, rtol=1e-4, atol=2e-6 * scale)
+    torch.testing.assert_close(torch.stack(found), torch.stack(expected), rtol=1e-5, atol=1e-6)
+
+
+def test_by_hand_is_the_quotient_of_differences():
+    online, target = networks(4, (6, 5), 3, seed=2)
+    for flat in (online, target):
+        flat.network.double()
+    online, target = FlatNetwork(online.network), FlatNetwork(target.network)
+    batch = Batch(*(part.double() if part.is_floating_point() else part for part in random_batch(20, (4,), 3)))
+    gradients = HandWrittenGradients(online, target, False)
+    gradients(batch)
+    slopes, step = online.values.grad.clone(), 1e-6
+    for i in range(len(slopes)):
+        losses = []
+        for change in (step, -2 * step):
+            online.values.data[i] += change
+            losses.append(float(gradients(batch).loss))
+        online.values.data[i] += step
+        assert float(slopes[i]) == pytest.approx((losses[0] - losses[1]) / (2 * step), abs=1e-7)
+
+
+def test_flat_parameters_are_the_networks():
+    flat, _ = networks(3, (4,), 2)
+    before = [parameter.detach().clone() for parameter in flat.network.parameters()]
+    assert torch.equal(flat.values.data, torch.cat([parameter.reshape(-1) for parameter in before]))
+    flat.values.data.add_(1.0)
+    for parameter, old in zip(flat.network.parameters(), before, strict=True):
+        assert torch.equal(parameter, old + 1.0)
+    flat.network.load_state_dict({name: tensor * 0 + 3 for name, tensor in flat.network.state_dict().items()})
+    assert (flat.values == 3).all() and all((weight == 3).all() and (bias == 3).all() for weight, bias in flat.layers)
+
+
+def test_a_copy_is_of_its_own():
+    flat, _ = networks(3, (4,), 2)
+    other = flat.copy()
+    assert torch.equal(other.values, flat.values)
+    flat.values.data.zero_()
+    assert float(other.values.detach().abs().max()) > 0
