@@ -54,6 +54,12 @@ class FlatNetwork:
         self.layers = list(zip(views[::2], views[1::2], strict=True))
         self.gradients = list(zip(slopes[::2], slopes[1::2], strict=True))
 
+    def clip_gradients(self, max_norm: float) -> None:
+        """Scales the gradients down to the norm `max_norm`, as `torch.nn.utils.clip_grad_norm_` does."""
+        assert self.values.grad is not None
+        norm = torch.linalg.vector_norm(self.values.grad)
+        self.values.grad.mul_((max_norm / (norm + 1e-6)).clamp_(max=1.0))
+
     def copy(self) -> FlatNetwork:
         """Another network with the same parameters."""
         return FlatNetwork(copy.deepcopy(self.network))
@@ -116,7 +122,8 @@ class HandWrittenGradients:
             torch.mm(delta.t(), activations[i], out=weight_slope)
             torch.sum(delta, dim=0, out=bias_slope)
             if i:
-                delta = torch.mm(delta, self._online.layers[i][0]).mul_(activations[i] > 0)
+                delta = torch.mm(delta, self._online.layers[i][0])
+                delta = torch.ops.aten.threshold_backward(delta, activations[i], 0)  # ReLU's slope, 1 above 0
 
 
 def _forward(network: FlatNetwork, observation: Tensor) -> list[Tensor]:

@@ -70,7 +70,7 @@ class Learner:
 
     def _step(self, columns: dict[str, Tensor], part: slice) -> Tensor:
         measured = self._gradients(as_batch(columns, part))
-        torch.nn.utils.clip_grad_norm_([self._online.values], self._settings.max_gradient_norm)
+        self._online.clip_gradients(self._settings.max_gradient_norm)
         self.optimiser.step()
         self.updates += 1
         if self.updates % self._settings.target_update_interval == 0:

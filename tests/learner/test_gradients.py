@@ -82,3 +82,16 @@ def test_a_copy_is_of_its_own():
     assert torch.equal(other.values, flat.values)
     flat.values.data.zero_()
     assert float(other.values.detach().abs().max()) > 0
+
+
+@pytest.mark.parametrize("limit", [0.1, 5.0, 100.0])
+def test_gradients_are_clipped_as_pytorch_clips_them(limit):
+    flat, _ = networks(3, (4,), 2)
+    slopes = torch.randn_like(flat.values) * 3
+    flat.values.grad.copy_(slopes)
+    flat.clip_gradients(limit)
+    other = torch.nn.Parameter(flat.values.detach().clone())
+    other.grad = slopes.clone()
+    norm = float(torch.nn.utils.clip_grad_norm_([other], limit))
+    torch.testing.assert_close(flat.values.grad, other.grad)
+    assert float(flat.values.grad.norm()) == pytest.approx(min(norm, limit), rel=1e-5)
