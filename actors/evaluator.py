@@ -93,18 +93,40 @@ class _Step(NamedTuple):
 
 
 class _Worlds:
-    """Our own worlds, which FL-ORCA may drive; ended ones are stepped on, to no effect on others."""
+    """Our own worlds, which FL-ORCA may drive; once half of them have ended, those that run go on alone."""
 
     def __init__(self, config: WorldConfig, seeds: list[int]) -> None:
         self._worlds = WorldBatch(config, len(seeds))
         self._worlds.seed(seeds)
+        self._episode = np.arange(len(seeds))  # of every world that is still stepped
+        self._over = np.zeros(len(seeds), np.bool_)  # those that have ended among them
+        self._last = _Step(
+            observation=self._worlds.reset(),
+            reward=np.zeros(len(seeds)),
+            ended=np.zeros(len(seeds), np.bool_),
+            outcome=np.zeros(len(seeds), np.int8),
+        )
 
     def start(self) -> NDArray[Any]:
-        return self._worlds.reset()
+        return self._last.observation
 
     def step(self, action: NDArray[np.int64] | None) -> _Step:
-        result = self._worlds.step(action)
-        return _Step(result.observation, result.reward.astype(np.float64), is_done(result.outcome), result.outcome)
+        result = self._worlds.step(None if action is None else action[self._episode])
+        done = is_done(result.outcome)
+        for kept, new in zip(self._last, (result.observation, result.reward, done, result.outcome), strict=True):
+            kept[self._episode] = new
+        self._over |= done
+        if self._over.mean() >= 0.5 and not self._over.all():
+            self._leave_ended()
+        return self._last
+
+    def _leave_ended(self) -> None:
+        running = ~self._over
+        state = {name: array[running] for name, array in self._worlds.get_state().items()}
+        self._episode = self._episode[running]
+        self._over = self._over[running]
+        self._worlds = WorldBatch(self._worlds.config, len(self._episode))
+        self._worlds.set_state(state)
 
     def close(self) -> None:
         pass
