@@ -45,7 +45,8 @@ class Entry(NamedTuple):
 
 def _load(folder: RunFolder, config: RunConfig) -> WeightsSnapshot:
     shape = env_shape(config.env)
-    if folder.policy.is_file() and not folder.checkpoints.exists():  # a sweep keeps its runs' policies alone
+    is_swept = folder.results.is_file() or not folder.checkpoints.exists()
+    if folder.policy.is_file() and is_swept:  # of a cell that is done, only the policy is kept
         return read_saved_policy(folder.policy, config, shape)
     checkpoint, skipped = newest_valid(folder.checkpoints)
     for reason in skipped:

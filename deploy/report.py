@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,37 +18,40 @@ from dashboards.pictures import save_png
 from dashboards.pooled import Results
 from dashboards.report import PresetPart, baselines_of, presets_of, report_markdown
 from dashboards.result_figures import PICTURES
+from deploy.folders import make_folder
 from sim_core.checks import require
 
 if TYPE_CHECKING:
     from deploy.options import Report
-
-PRESET_NAME = re.compile(r"\w[\w.+=,\[\] -]*")
-"""What a preset may be called: it names a folder where there are several."""
 
 
 def report(command: Report) -> int:
     """Writes the report of a table; returns the exit code.
 
     Raises:
-      ConfigError: the table cannot be read, holds no learned policy, or names a preset that no folder can be named.
+      ConfigError: the table cannot be read or holds no learned policy, or the folder cannot be written to.
     """
     rows = read_table(command.results)
     presets = presets_of(rows)
     require(bool(presets), f"{command.results} holds no results of a learned policy; run a sweep first")
     parts = []
     for preset in presets:
-        good = PRESET_NAME.fullmatch(preset) is not None
-        require(good, f"{command.results} names a preset {preset!r}, which cannot name a folder")
         own = [row for row in rows if row.preset == preset]
-        folder = f"{preset}/" if len(presets) > 1 else ""
+        folder = f"{_folder_name(preset)}/" if len(presets) > 1 else ""
         results = Results(own)
         parts.append(PresetPart(preset, results, judge(results), folder, baselines_of(own)))
+    make_folder(command.out, "--out")
     _write(command.out, command.results.name, parts)
     for part in parts:
         Console().print(f"{part.name}: {tally(part.claims)}", highlight=False)
     Console().print(str(command.out / "report.md"), highlight=False, soft_wrap=True)
     return 0
+
+
+def _folder_name(preset: str) -> str:
+    """The preset's name where it can name a folder and stand in a link, else what is left of it and a hash."""
+    plain = re.sub(r"[^\w.+=-]+", "-", preset)
+    return plain if plain == preset else f"{plain}-{zlib.crc32(preset.encode()):08x}"
 
 
 def _write(out: Path, source: str, parts: list[PresetPart]) -> None:

@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import json
+import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
 
 from actors.result_table import ResultRow, read_table, write_table
+from deploy.folders import make_folder
 from deploy.options import Sweep
 from deploy.sweep_board import SweepBoard, make_board
-from deploy.training import make_folder
 from learner.config import to_dict
-from learner.sweep import SweepConfig, done_cells, make_cells
+from learner.sweep import Cell, SweepConfig, cell_hash, done_cells, make_cells
 from learner.tracker import Tracker, git_commit
-from learner.trial import RESULTS, SweepPlace
+from learner.trial import SweepPlace
 from learner.tune_edge import run_cells
-from sim_core.checks import require
+from sim_core.checks import ConfigError, require
 
 CELLS = "cells"
+RESULTS = "results.csv"
 
 
 class SweepResults:
@@ -28,39 +33,71 @@ class SweepResults:
 
     Args:
       grid: the sweep.
-      folder: its folder.
-      known: results of earlier sittings.
+      folder: its folder, made if missing.
+      known: results of earlier sittings, beside those that the folder's table holds already.
 
     Raises:
-      ConfigError: a setup is not possible.
+      ConfigError: a setup is not possible, or the folder cannot be written to.
     """
 
     def __init__(self, grid: SweepConfig, folder: Path, known: list[ResultRow]) -> None:
         self._grid = grid
-        self._known = known
         self.folder = folder
         self.table = folder / RESULTS
         self.cells = make_cells(grid)
+        make_folder(folder, "--runs-dir")
+        self._known = [*known, *(read_table(self.table) if self.table.is_file() else [])]
+        self._commit = git_commit()
+
+    def _rows(self) -> list[ResultRow]:
+        """All rows: of two of the same evaluation the one of more episodes, none of a cell's former settings."""
+        own = [row for path in sorted((self.folder / CELLS).glob(f"*/{RESULTS}")) for row in read_table(path)]
+        newest = {_place(cell, self._grid): cell_hash(cell.config) for cell in self.cells}
+        best: dict[tuple[object, ...], ResultRow] = {}
+        for row in sorted([*self._known, *own], key=lambda row: row.episodes):
+            trained = (row.preset, row.policy, row.method, row.trained_robots, row.trained_groups, row.seed)
+            if newest.get(trained, row.config) == row.config:
+                best[*trained, row.robots, row.groups] = row
+        return list(best.values())
 
     def done(self) -> dict[str, list[ResultRow]]:
         """The results of every finished cell, by key."""
-        own = [row for path in sorted((self.folder / CELLS).glob(f"*/{RESULTS}")) for row in read_table(path)]
-        return done_cells(self._grid, self.cells, [*self._known, *own])
+        return done_cells(self._grid, self.cells, self._rows())
 
     def write(self) -> dict[str, list[ResultRow]]:
-        """Writes `results.csv`, the rows of all finished cells, and `settings.json`, how they came about.
+        """Writes `results.csv`, all rows of the sweep's sittings, and `settings.json`, how the last came about.
 
         Returns:
           See `done`.
         """
-        done = self.done()
-        write_table(self.table, [row for rows in done.values() for row in rows])
+        rows = self._rows()
+        write_table(self.table, rows)
         examples = {cell.config.world.method: to_dict(cell.config) for cell in reversed(self.cells)}
-        settings = {"sweep": dataclasses.asdict(self._grid), "commit": git_commit(), "a_cell_of_each_method": examples}
+        settings = {"sweep": dataclasses.asdict(self._grid), "commit": self._commit, "a_cell_of_each_method": examples}
         part = self.folder / "settings.json.part"
         part.write_text(json.dumps(settings, indent=1) + "\n")
         part.replace(self.folder / "settings.json")
-        return done
+        return done_cells(self._grid, self.cells, rows)
+
+
+def _place(cell: Cell, grid: SweepConfig) -> tuple[object, ...]:
+    world = cell.config.world
+    return (grid.label, cell.policy, world.method, world.robots, world.groups, cell.config.seed)
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Holds the sweep's folder, so that no two commands run its cells at once.
+
+    Raises:
+      ConfigError: another command holds it.
+    """
+    with (folder / "lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ConfigError(f"another `shoal sweep` is at work in {folder}; wait for it or end it") from error
+        yield
 
 
 class _Listener:
@@ -77,7 +114,11 @@ class _Listener:
         self._board.progressed(key, env_steps)
 
     def finished(self, key: str) -> None:
-        self._board.finished(key, self._results.write()[key])
+        done = self._results.write()
+        if key in done:
+            self._board.finished(key, done[key])
+        else:
+            self._board.failed(key, "its table of results is not whole")
 
     def failed(self, key: str, reason: str) -> None:
         self._board.failed(key, reason)
@@ -85,26 +126,32 @@ class _Listener:
 
 def sweep(command: Sweep) -> int:
     """Runs what is missing of a sweep and writes its table of results; returns the exit code."""
-    launch, name = command.launch, command.launch.name or command.grid.preset
+    launch, name = command.launch, command.launch.name or re.sub(r"[^\w.+=-]+", "-", command.grid.label)
     require(
         name == Path(name).name and name not in ("", ".", ".."), f"--name must be a plain folder name, not {name!r}"
     )
     folder = (launch.runs_dir / "sweeps" / name).absolute()
+    make_cells(command.grid)  # refuses what cannot be, before a folder is made
     results = SweepResults(command.grid, folder, read_table(command.known) if command.known else [])
-    make_folder(folder)
     console = Console(file=sys.stdout)  # by name: Tune's own output is kept from sys.stdout while it runs
     console.print(f"sweep {folder}", highlight=False, soft_wrap=True)
-    done = results.write()
-    board = make_board(console, results.cells, done)
-    missing = [cell for cell in results.cells if cell.key not in done]
-    if missing:
-        place = SweepPlace(folder / CELLS, launch.tracking(), launch.sweep_experiment(name))
-        # One process makes store and experiment, before several open them.
-        Tracker(place.tracking_uri, place.experiment, launch.artifact_root()).set_views()
-        with board:
-            listener = _Listener(board, results)
-            run_cells(command.grid, missing, place, launch.ray_address(), command.at_once, listener)
-    return _end(console, results, board)
+    with _alone_in(folder):
+        done = results.write()
+        board = make_board(console, results.cells, done)
+        missing = [cell for cell in results.cells if cell.key not in done]
+        if missing:
+            _run(command, name, results, missing, board)
+        return _end(console, results, board)
+
+
+def _run(command: Sweep, name: str, results: SweepResults, missing: list[Cell], board: SweepBoard) -> None:
+    launch = command.launch
+    place = SweepPlace(results.folder / CELLS, launch.tracking(), launch.sweep_experiment(name))
+    # One process makes store and experiment, before several open them.
+    Tracker(place.tracking_uri, place.experiment, launch.artifact_root()).set_views()
+    with board:
+        listener = _Listener(board, results)
+        run_cells(command.grid, missing, place, launch.ray_address(), command.at_once, listener)
 
 
 def _end(console: Console, results: SweepResults, board: SweepBoard) -> int:

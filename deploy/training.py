@@ -12,6 +12,7 @@ from rich.console import Console
 
 from actors.vector_env import env_shape
 from deploy.artifacts import log_artifacts
+from deploy.folders import make_folder
 from deploy.options import Launch, Resume, Train, ray_address
 from deploy.progress import make_display
 from deploy.tables import evaluation_table, summary_lines
@@ -21,7 +22,7 @@ from learner.journal import Row
 from learner.run import RunResult, execute, resume_point
 from learner.run_folder import RunFolder, RunIdentity, find_run
 from learner.tracker import Tracker
-from sim_core.checks import ConfigError, require
+from sim_core.checks import require
 
 
 def _new_folder(config: RunConfig, launch: Launch) -> RunFolder:
@@ -43,25 +44,13 @@ def train(command: Train) -> int:
         f"--name must be a plain folder name, not {launch.name!r}",
     )
     folder = _new_folder(config, launch)
-    make_folder(launch.runs_dir)
+    make_folder(launch.runs_dir, "--runs-dir")
     env_shape(config.env)  # refuses an environment that cannot be made
     tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
     tracker.start(config)
     folder.save_config(config)
     folder.save_identity(RunIdentity(config.name, tracker.uri, launch.experiment, tracker.run_id))
     return _run(folder, config, tracker, None, launch.ray_address())
-
-
-def make_folder(path: Path) -> None:
-    """Makes a folder for runs.
-
-    Raises:
-      ConfigError: it cannot be made.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--runs-dir {path} cannot be made ({error}); name a folder that you may write to") from error
 
 
 def resume(command: Resume) -> int:

@@ -1,4 +1,4 @@
-"""The one module that knows Ray: it places the plain classes as Ray actors and calls them.
+"""The module that knows Ray (sweeps have `tune_edge`): it places the plain classes as Ray actors and calls them.
 
 Rollout workers push to the shards themselves; the driver holds references and small reports only. The
 embedded shards live in the learner's actor; with `replay_placement = "actors"` each has its own.

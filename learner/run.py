@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -132,7 +133,8 @@ def execute(
             cluster.close()  # not after an error: references in its traceback must not outlive Ray, which ends at exit
             if result.evaluation is not None:
                 rows = journal.rows()
-                tracker.final(final_metrics(result.evaluation), rows[-1].time_ms)
+                time_ms = rows[-1].time_ms if rows else int(time.time() * 1000)
+                tracker.final(final_metrics(result.evaluation), time_ms)
                 finish(result, rows)
         status = "FINISHED" if result.stopped_by is None else "KILLED"
         return result

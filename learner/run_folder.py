@@ -34,6 +34,7 @@ class RunFolder:
         self.pushed = self.path / "metrics.pushed"
         self.artifacts = self.path / "artifacts"
         self.policy = self.path / "policy.safetensors"
+        self.results = self.path / "results.csv"
 
     def save_config(self, config: RunConfig) -> None:
         """Writes `config.json`."""

@@ -103,6 +103,10 @@ class Tracker:
         }
         run = self._client.create_run(self._experiment_id, tags={"mlflow.runName": config.name} | known | (tags or {}))
         self.run_id = run.info.run_id
+        self.log_params(config)
+
+    def log_params(self, config: RunConfig) -> None:
+        """Logs the whole config; what the run has already must be the same."""
         params = [Param(key, str(value)) for key, value in flat_params(config).items()]
         self._client.log_batch(self.run_id, params=params)
 

@@ -19,22 +19,21 @@ from actors.baselines import Baseline
 from actors.evaluation_store import StoredEvaluation, save_evaluation
 from actors.evaluator import evaluate
 from actors.network import WeightsSnapshot
-from actors.result_table import LEARNED, ResultRow, write_table
+from actors.result_table import LEARNED, ResultRow, read_table, write_table
 from actors.transitions import EpisodeStats
 from actors.vector_env import env_shape
 from learner.checkpoint import Checkpoint, CheckpointError
 from learner.config import RunConfig
 from learner.journal import Row
-from learner.policy_file import save_policy
+from learner.policy_file import read_saved_policy, save_policy
 from learner.results import final_metrics, summarise
 from learner.run import RunResult, execute, resume_point
 from learner.run_folder import RunFolder, RunIdentity
-from learner.sweep import Cell, SweepConfig, cell_hash, other_worlds
+from learner.sweep import Cell, SweepConfig, cell_hash, done_cells, other_worlds
 from learner.tracker import Tracker
 from sim_core.config import WorldConfig
 from sim_core.outcomes import ENDED
 
-RESULTS = "results.csv"
 EVALUATIONS = "evaluations"
 
 
@@ -90,6 +89,7 @@ def _start_or_find(cell: Cell, sweep: SweepConfig, folder: RunFolder, place: Swe
     known = tracker.find_run("cell", cell.key)
     if known:
         tracker.resume(known)
+        tracker.log_params(cell.config)  # which a kill may have kept from it
     else:
         tracker.start(cell.config, _tags(cell, sweep))
     folder.save_config(cell.config)
@@ -127,14 +127,18 @@ def run_cell(sweep: SweepConfig, cell: Cell, place: SweepPlace, on_row: Callable
       The cell's table of results.
     """
     folder = RunFolder(place.cells / cell.key)
-    table = folder.path / RESULTS
-    if table.is_file():
-        return table
+    if folder.results.is_file() and done_cells(sweep, [cell], read_table(folder.results)):
+        return folder.results
     tracker = _start_or_find(cell, sweep, folder, place)
-    (_play_baseline if cell.policy != LEARNED else _train)(sweep, cell, folder, tracker, on_row)
-    (folder.artifacts / RESULTS).rename(table)  # once MLflow has all and its run is closed
+    if cell.policy != LEARNED:
+        _play_baseline(sweep, cell, folder, tracker)
+    elif folder.policy.is_file() and not folder.checkpoints.exists():
+        _play_again(sweep, cell, folder, tracker)
+    else:
+        _train(sweep, cell, folder, tracker, on_row)
+    _new_table(folder).rename(folder.results)  # once MLflow has all and its run is closed
     shutil.rmtree(folder.checkpoints, ignore_errors=True)  # the policy and the results stay
-    return table
+    return folder.results
 
 
 def _train(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker, on_row: Callable[[Row], None]) -> None:
@@ -150,12 +154,22 @@ def _train(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker, 
     execute(folder, cell.config, tracker, RowDisplay(on_row), _checkpoint(folder, cell.config), None, finish)
 
 
-def _play_baseline(
-    sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker, on_row: Callable[[Row], None]
-) -> None:
-    """Plays a baseline's episodes, of which there is nothing to resume and no training to tell."""
-    seeds = list(range(sweep.first_seed, sweep.first_seed + cell.config.final_eval_episodes))
-    stats = evaluate(cell.config.env, Baseline(cell.policy), seeds)
+def _fixed_seeds(cell: Cell) -> list[int]:
+    first = cell.config.final_eval_first_seed
+    return list(range(first, first + cell.config.final_eval_episodes))
+
+
+def _play_again(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker) -> None:
+    """Evaluates the kept policy of a cell that was done, in a sweep that wants it played in more setups."""
+    weights = read_saved_policy(folder.policy, cell.config, env_shape(cell.config.env))
+    fixed = evaluate(cell.config.env, weights, _fixed_seeds(cell))
+    _log_table(_evaluate_all(sweep, cell, folder, weights, fixed), folder, tracker)
+    tracker.end("FINISHED")
+
+
+def _play_baseline(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker) -> None:
+    """Plays a baseline's episodes, of which there is nothing to resume."""
+    stats = evaluate(cell.config.env, Baseline(cell.policy), _fixed_seeds(cell))
     tracker.final(final_metrics(summarise(stats)), int(time.time() * 1000))
     _log_table([_stored(sweep, cell, cell.config, stats, folder, 0)], folder, tracker)
     tracker.end("FINISHED")
@@ -163,9 +177,13 @@ def _play_baseline(
 
 def _log_table(results: list[ResultRow], folder: RunFolder, tracker: Tracker) -> None:
     """Writes and logs the table of a cell's results, which does not count yet."""
-    table = folder.artifacts / RESULTS
+    table = _new_table(folder)
     write_table(table, results)
     tracker.artifact(table)
+
+
+def _new_table(folder: RunFolder) -> Path:
+    return folder.artifacts / folder.results.name
 
 
 def _evaluate_all(

@@ -30,6 +30,7 @@ REPORT_EVERY_S = 2.0
 """Least time between two reports of a cell."""
 
 os.environ.setdefault("TUNE_DISABLE_AUTO_CALLBACK_LOGGERS", "1")  # cells write their own results
+os.environ.setdefault("RAY_CHDIR_TO_TRIAL_DIR", "0")  # relative paths mean the same in a cell as in the driver
 os.environ.setdefault("TUNE_DISABLE_SIGINT_HANDLER", "1")  # Ctrl-C ends a sweep at once; it can go on at any time
 
 

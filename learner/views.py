@@ -17,7 +17,7 @@ FAILURES = ("lost", "captured", "collision", "timeout")
 
 
 def _chart(kind: str, section: str, name: str, **settings: Any) -> dict[str, Any]:
-    base = {"runsCountToCompare": 100, "deleted": False, "isGenerated": False, "displayName": name}
+    base = {"runsCountToCompare": 300, "deleted": False, "isGenerated": False, "displayName": name}
     return {"uuid": f"{section}-{name}", "type": kind, "metricSectionId": section, **base, **settings}
 
 
@@ -48,7 +48,7 @@ def _state(charts: dict[str, list[dict[str, Any]]], group_by: str | None = None)
     keys = [{"mode": "param", "groupByData": group_by}]
     metrics = ["final/success_rate", *(f"final/{failure}_rate" for failure in FAILURES)]
     return {
-        "searchFilter": "",
+        "searchFilter": "tags.policy = 'learned'",
         "orderByKey": "metrics.`final/success_rate`",
         "orderByAsc": False,
         "startTime": "ALL",

@@ -68,7 +68,6 @@ def test_the_same_results_give_the_same_bytes(both: dict[str, bytes], tmp_path: 
     [
         ([], "no results of a learned policy"),
         ([row("sensor", Setup(5, 1), success=50)._replace(policy="orca")], "no results of a learned policy"),
-        ([row("sensor", Setup(5, 1), success=50, preset="../elsewhere")], "names a preset '../elsewhere'"),
     ],
 )
 def test_refuses_what_cannot_be_reported(rows: list[ResultRow], message: str, tmp_path: Path):
@@ -81,3 +80,20 @@ def test_refuses_what_cannot_be_reported(rows: list[ResultRow], message: str, tm
 def test_refuses_a_file_that_is_not_there(tmp_path: Path):
     with pytest.raises(ConfigError, match="cannot be read"):
         report(Report(results=tmp_path / "none.csv", out=tmp_path / "out"))
+
+
+def test_a_presets_name_leads_nowhere_else(tmp_path: Path):
+    names = ("../elsewhere", "thesis+a=[1, 2]", "thesis")
+    made([row("sensor", Setup(5, 1), success=50, preset=name) for name in names], tmp_path, "deep/out")
+    assert {path.name for path in tmp_path.iterdir()} == {"results.csv", "deep"}
+    assert {path.name for path in (tmp_path / "deep").iterdir()} == {"out"}
+    folders = {path.name for path in (tmp_path / "deep" / "out").iterdir() if path.is_dir()}
+    assert len(folders) == 3 and "thesis" in folders and not any(" " in name or "[" in name for name in folders)
+
+
+@pytest.mark.parametrize("out", ["file", "file/deeper"])
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path, out: str):
+    write_table(tmp_path / "results.csv", [row("sensor", Setup(5, 1), success=50)])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="--out"):
+        report(Report(results=tmp_path / "results.csv", out=tmp_path / out))

@@ -1,5 +1,7 @@
 """A sweep over Ray Tune: killed twice and run again, it has every cell once, as if nothing had happened."""
 
+import fcntl
+
 import mlflow
 import pytest
 
@@ -74,6 +76,38 @@ def test_cells_of_an_earlier_sitting_are_not_run_again(capsys, tmp_path, monkeyp
     assert "8 of 8 cells" in capsys.readouterr().out
     assert read_table(tmp_path / "runs/sweeps/s/results.csv") == rows
     assert not (tmp_path / "runs/sweeps/s/cells").exists()
+
+
+def results_of(folder, *arguments):
+    """The table after a sweep whose cells are all known; nothing may run."""
+    assert main(["sweep", "--runs-dir", str(folder / "runs"), *arguments]) == 0
+    return read_table(folder / "runs/sweeps/s/results.csv")
+
+
+def test_a_smaller_grid_of_the_same_name_leaves_the_others_results(capsys, tmp_path):
+    rows = results_in_one_process(tmp_path / "alone")
+    write_table(tmp_path / "known.csv", rows)
+    assert results_of(tmp_path, *COMMAND[1:], "--known", str(tmp_path / "known.csv")) == rows
+    assert results_of(tmp_path, *COMMAND[1:]) == rows, "the folder's own table is known"
+    fewer = [*COMMAND[1:], "--methods", "in"]
+    assert results_of(tmp_path, *fewer) == rows
+    assert "4 of 4 cells" in capsys.readouterr().out
+
+
+def test_results_of_former_settings_are_left_out(tmp_path):
+    rows = results_in_one_process(tmp_path / "alone")
+    former = [row._replace(config="0" * 12) for row in rows]
+    write_table(tmp_path / "known.csv", [*former, *rows])
+    assert results_of(tmp_path, *COMMAND[1:], "--known", str(tmp_path / "known.csv")) == rows
+
+
+def test_two_sweeps_in_one_folder_are_refused(capsys, tmp_path):
+    folder = tmp_path / "runs" / "sweeps" / "s"
+    folder.mkdir(parents=True)
+    with (folder / "lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert main([*COMMAND, "--runs-dir", str(tmp_path / "runs")]) == 2
+    assert "another `shoal sweep` is at work" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

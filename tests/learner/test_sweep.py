@@ -17,7 +17,7 @@ def rows_of(sweep, cell):
     world = cell.config.world
     return [
         ResultRow(
-            preset=sweep.preset,
+            preset=sweep.label,
             policy="learned",
             method=world.method,
             trained_robots=world.robots,
@@ -94,6 +94,8 @@ def test_a_setting_that_is_as_by_default_does_not_count(monkeypatch):
 def test_the_length_of_the_training_takes_its_schedule_along():
     config = make_cell(dataclasses.replace(SMALL, env_steps=400_000), "out", 5, 1, 0).config
     assert config.total_env_steps == config.learning_rate_decay_env_steps == 400_000
+    preset = make_cell(SMALL, "out", 5, 1, 0).config
+    assert config.epsilon_decay_env_steps / 400_000 == preset.epsilon_decay_env_steps / preset.total_env_steps
 
 
 def test_baselines_are_played_in_the_world_of_every_cell():
@@ -123,8 +125,9 @@ def test_settings_take_the_place_of_the_presets():
     assert dataclasses.replace(config, n_step=preset.n_step, hidden_sizes=preset.hidden_sizes, world=world) == preset
     assert sweep.label == "thesis+n_step=5+apf_rows=all+time_step_s=0.04+hidden_sizes=[64, 32]"
     assert SMALL.label == "thesis"
-    rows = rows_of(SMALL, make_cell(SMALL, "in", 5, 2, 0))
+    rows = [row._replace(preset=sweep.label) for row in rows_of(SMALL, make_cell(SMALL, "in", 5, 2, 0))]
     assert not done_cells(sweep, make_cells(sweep), rows)
+    assert done_cells(sweep, make_cells(sweep), rows_of(sweep, make_cell(sweep, "in", 5, 2, 0)))
 
 
 @pytest.mark.parametrize(
@@ -135,6 +138,8 @@ def test_settings_take_the_place_of_the_presets():
         ("n_stp=3", "cannot change 'n_stp'"),
         ("robots=7", "cannot change 'robots'"),
         ("seed=7", "cannot change 'seed'"),
+        ("final_eval_first_seed=7", "cannot change 'final_eval_first_seed'"),
+        ("total_env_steps=70000", "cannot change 'total_env_steps'"),
     ],
 )
 def test_what_is_no_setting_is_refused(text, words):

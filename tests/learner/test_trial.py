@@ -104,6 +104,18 @@ def test_a_baselines_cell_counts_its_episodes(store, cell, tmp_path):
     assert runs[0].data.metrics["final/success_rate"] == rows[0].goal / 40
 
 
+def test_a_finished_cell_of_which_more_is_wanted_plays_its_policy_again(store, cell, tmp_path):
+    cell = cell._replace(key=f"{cell.key}-more")
+    place = SweepPlace(tmp_path, store, "cells")
+    small = dataclasses.replace(SWEEP, robots=(3,), groups=(2,))
+    fixed = read_table(run_cell(small, cell, place, lambda row: None))
+    assert len(fixed) == 1
+    rows = read_table(run_cell(SWEEP, cell, place, crashing_at(0)))  # nothing is trained
+    other = cell._replace(key=f"{cell.key}-whole")
+    assert rows == read_table(run_cell(SWEEP, other, place, lambda row: None)) and fixed[0] in rows
+    assert [run.info.status for run in runs_of(store, cell)[1]] == ["FINISHED"]
+
+
 def test_a_finished_cell_is_not_run_again(store, cell, tmp_path):
     place = SweepPlace(tmp_path, store, "cells")
     table = run_cell(SWEEP, cell, place, lambda row: None)

@@ -1,0 +1,21 @@
+"""Folders that the command line writes to."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from sim_core.checks import ConfigError, require
+
+
+def make_folder(path: Path, flag: str) -> None:
+    """Makes the folder that a flag names, if it is missing.
+
+    Raises:
+      ConfigError: it cannot be made or written to.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{flag} {path} cannot be made ({error}); name a folder that you may write to") from error
+    require(os.access(path, os.W_OK), f"{flag} {path} cannot be written to; name a folder that you may write to")

@@ -1,0 +1,70 @@
+"""The committed results: `shoal report` makes the committed report of them, and the presets are still theirs."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import dashboards
+from actors.result_table import LEARNED, read_table
+from deploy.cli import main
+from learner.config import RunConfig, to_dict
+from learner.sweep import SweepConfig, cell_hash, make_cell
+
+ROOT = Path(dashboards.__file__).parent / "results"
+FOLDERS = sorted(path.parent for path in ROOT.glob("*/results.csv"))
+
+
+def sweep_of(folder):
+    values = json.loads((folder / "settings.json").read_text())["sweep"]
+    plain = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    return SweepConfig(**plain)
+
+
+def test_there_are_results():
+    assert FOLDERS
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_the_report_is_that_of_the_results(folder, tmp_path):
+    assert main(["report", str(folder / "results.csv"), "--out", str(tmp_path)]) == 0
+    made = {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()}
+    assert made == {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()} - {
+        Path("results.csv"),
+        Path("settings.json"),
+    }
+    for name in made:
+        if name.suffix == ".md":
+            assert (folder / name).read_text() == (tmp_path / name).read_text()
+        else:  # another version of the plotting library may move letters by a pixel
+            committed, new = (np.asarray(Image.open(root / name).convert("RGB"), float) for root in (folder, tmp_path))
+            assert committed.shape == new.shape
+            assert np.abs(committed - new).mean() < 2.0
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_the_rows_are_of_the_preset_as_it_is(folder):
+    sweep = sweep_of(folder)
+    rows = [row for row in read_table(folder / "results.csv") if row.policy == LEARNED]
+    assert rows
+    for row in rows:
+        assert row.preset == sweep.label
+        cell = make_cell(sweep, row.method, row.trained_robots, row.trained_groups, row.seed)
+        assert row.config == cell_hash(cell.config)
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_no_default_has_moved_under_the_results(folder):
+    # The hash leaves out what is as by default, so a default that changes must show here.
+    stored = json.loads((folder / "settings.json").read_text())["a_cell_of_each_method"]
+    assert stored
+    for method, values in stored.items():
+        now = to_dict(
+            make_cell(sweep_of(folder), method, values["world"]["robots"], values["world"]["groups"], 0).config
+        )
+        now = json.loads(json.dumps(now))
+        for name in values.keys() - {"world", "seed"} & RunConfig.__dataclass_fields__.keys():
+            assert now[name] == values[name], name
+        assert {name: now["world"][name] for name in values["world"]} == values["world"]
