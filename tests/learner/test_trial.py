@@ -116,6 +116,14 @@ def test_a_finished_cell_of_which_more_is_wanted_plays_its_policy_again(store, c
     assert [run.info.status for run in runs_of(store, cell)[1]] == ["FINISHED"]
 
 
+def test_a_training_too_short_for_a_row_of_metrics_ends_like_others(store, cell, tmp_path):
+    config = dataclasses.replace(cell.config, log_every_env_steps=100_000, eval_every_env_steps=100_000)
+    short = Cell(f"{cell.key}-short", config)
+    assert len(read_table(run_cell(SWEEP, short, SweepPlace(tmp_path, store, "cells"), crashing_at(0)))) == 4
+    runs = runs_of(store, short)[1]
+    assert [run.info.status for run in runs] == ["FINISHED"] and "final/success_rate" in runs[0].data.metrics
+
+
 def test_a_finished_cell_is_not_run_again(store, cell, tmp_path):
     place = SweepPlace(tmp_path, store, "cells")
     table = run_cell(SWEEP, cell, place, lambda row: None)
