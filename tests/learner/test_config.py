@@ -114,6 +114,7 @@ def changed(config, name):
         "exploration": "ladder",
         "replay_placement": "actors" if value == "learner" else "learner",
         "algorithm": "dqn",
+        "gradients": "autograd",
         "env_id": "CartPole-v1",
         "world": dataclasses.replace(config.world, reward_scale=2.0),
         "hidden_sizes": (*config.hidden_sizes, 4),
