@@ -19,3 +19,9 @@ def make_folder(path: Path, flag: str) -> None:
     except OSError as error:
         raise ConfigError(f"{flag} {path} cannot be made ({error}); name a folder that you may write to") from error
     require(os.access(path, os.W_OK), f"{flag} {path} cannot be written to; name a folder that you may write to")
+
+
+def check_plain_name(name: str) -> None:
+    """Raises ConfigError unless `--name` names a folder within another, and none elsewhere."""
+    plain = name == Path(name).name and name not in ("", ".", "..")
+    require(plain, f"--name must be a plain folder name, not {name!r}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import fcntl
-import json
 import re
 import sys
 from collections.abc import Iterator
@@ -14,15 +13,16 @@ from pathlib import Path
 from rich.console import Console
 
 from actors.result_table import ResultRow, read_table, write_table
-from deploy.folders import make_folder
+from deploy.folders import check_plain_name, make_folder
 from deploy.options import Sweep
 from deploy.sweep_board import SweepBoard, make_board
 from learner.config import to_dict
+from learner.run_folder import write_json
 from learner.sweep import Cell, SweepConfig, cell_hash, done_cells, make_cells
 from learner.tracker import Tracker, git_commit
 from learner.trial import SweepPlace
 from learner.tune_edge import run_cells
-from sim_core.checks import ConfigError, require
+from sim_core.checks import ConfigError
 
 CELLS = "cells"
 RESULTS = "results.csv"
@@ -44,7 +44,7 @@ class SweepResults:
         self._grid = grid
         self.folder = folder
         self.table = folder / RESULTS
-        self.cells = make_cells(grid)
+        self.cells = make_cells(grid)  # refuses what cannot be, before a folder is made
         make_folder(folder, "--runs-dir")
         self._known = [*known, *(read_table(self.table) if self.table.is_file() else [])]
         self._commit = git_commit()
@@ -60,23 +60,17 @@ class SweepResults:
                 best[*trained, row.robots, row.groups] = row
         return list(best.values())
 
-    def done(self) -> dict[str, list[ResultRow]]:
-        """The results of every finished cell, by key."""
-        return done_cells(self._grid, self.cells, self._rows())
-
     def write(self) -> dict[str, list[ResultRow]]:
         """Writes `results.csv`, all rows of the sweep's sittings, and `settings.json`, how the last came about.
 
         Returns:
-          See `done`.
+          The results of every finished cell, by key.
         """
         rows = self._rows()
         write_table(self.table, rows)
         examples = {cell.config.world.method: to_dict(cell.config) for cell in reversed(self.cells)}
         settings = {"sweep": dataclasses.asdict(self._grid), "commit": self._commit, "a_cell_of_each_method": examples}
-        part = self.folder / "settings.json.part"
-        part.write_text(json.dumps(settings, indent=1) + "\n")
-        part.replace(self.folder / "settings.json")
+        write_json(self.folder / "settings.json", settings)
         return done_cells(self._grid, self.cells, rows)
 
 
@@ -127,11 +121,8 @@ class _Listener:
 def sweep(command: Sweep) -> int:
     """Runs what is missing of a sweep and writes its table of results; returns the exit code."""
     launch, name = command.launch, command.launch.name or re.sub(r"[^\w.+=-]+", "-", command.grid.label)
-    require(
-        name == Path(name).name and name not in ("", ".", ".."), f"--name must be a plain folder name, not {name!r}"
-    )
+    check_plain_name(name)
     folder = (launch.runs_dir / "sweeps" / name).absolute()
-    make_cells(command.grid)  # refuses what cannot be, before a folder is made
     results = SweepResults(command.grid, folder, read_table(command.known) if command.known else [])
     console = Console(file=sys.stdout)  # by name: Tune's own output is kept from sys.stdout while it runs
     console.print(f"sweep {folder}", highlight=False, soft_wrap=True)

@@ -6,13 +6,12 @@ import dataclasses
 import datetime
 import shlex
 import signal
-from pathlib import Path
 
 from rich.console import Console
 
 from actors.vector_env import env_shape
 from deploy.artifacts import log_artifacts
-from deploy.folders import make_folder
+from deploy.folders import check_plain_name, make_folder
 from deploy.options import Launch, Resume, Train, ray_address
 from deploy.progress import make_display
 from deploy.tables import evaluation_table, summary_lines
@@ -39,10 +38,8 @@ def _new_folder(config: RunConfig, launch: Launch) -> RunFolder:
 def train(command: Train) -> int:
     """Starts a run; returns the exit code."""
     config, launch = command.run, command.launch
-    require(
-        launch.name is None or (launch.name == Path(launch.name).name and launch.name not in ("", ".", "..")),
-        f"--name must be a plain folder name, not {launch.name!r}",
-    )
+    if launch.name is not None:
+        check_plain_name(launch.name)
     folder = _new_folder(config, launch)
     make_folder(launch.runs_dir, "--runs-dir")
     env_shape(config.env)  # refuses an environment that cannot be made

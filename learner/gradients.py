@@ -1,7 +1,7 @@
 """The update's gradients, by automatic differentiation or written by hand; both fill the same flat buffer.
 
 Networks of this size are bound by what surrounds their arithmetic: written by hand, the online network sees both states
-in one pass, nothing is recorded, and every array that an update needs is there before it begins.
+in one pass, nothing is recorded for a backward pass, and the gradients are written where the optimiser reads them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from actors.network import QNetwork
-from learner.double_dqn import Batch, huber_loss, targets
+from learner.double_dqn import Batch, double_q_target, huber_loss, q_target, targets
 
 
 class Measured(NamedTuple):
@@ -105,8 +105,10 @@ class HandWrittenGradients:
         seen = torch.cat([s_tm1, s_t]) if self._double else s_tm1
         activations = _forward(self._online, seen)
         q_tm1, q_t_target = activations[-1][:size], _forward(self._target, s_t)[-1]
-        best = (activations[-1][size:] if self._double else q_t_target).argmax(dim=1, keepdim=True)
-        fixed = batch.r_t + batch.discount_t * q_t_target.gather(1, best).squeeze(1)
+        if self._double:
+            fixed = double_q_target(activations[-1][size:], q_t_target, batch.r_t, batch.discount_t)
+        else:
+            fixed = q_target(q_t_target, batch.r_t, batch.discount_t)
         action = batch.a_tm1.unsqueeze(1)
         td_error = fixed - q_tm1.gather(1, action).squeeze(1)
         slope = td_error.clamp(-1.0, 1.0)  # of Huber's loss, delta = 1

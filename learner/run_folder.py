@@ -38,7 +38,7 @@ class RunFolder:
 
     def save_config(self, config: RunConfig) -> None:
         """Writes `config.json`."""
-        _write(self.path / "config.json", to_dict(config))
+        write_json(self.path / "config.json", to_dict(config))
 
     def config(self) -> RunConfig:
         """Reads `config.json`.
@@ -50,7 +50,7 @@ class RunFolder:
 
     def save_identity(self, identity: RunIdentity) -> None:
         """Writes `run.json`."""
-        _write(self.path / "run.json", identity._asdict())
+        write_json(self.path / "run.json", identity._asdict())
 
     def identity(self) -> RunIdentity:
         """Reads `run.json`.
@@ -79,7 +79,8 @@ def find_run(name: str, runs_dir: Path) -> RunFolder:
     raise ConfigError(f"there is no run {name!r}; {hint}")
 
 
-def _write(path: Path, values: dict[str, Any]) -> None:
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Writes a JSON file; an older one is replaced once the new is whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")
     with part.open("w") as file:
