@@ -51,11 +51,14 @@ class GreedySensorPlayer:
     """
 
     def __init__(self, config: WorldConfig) -> None:
-        self._sectors = config.sectors
+        self._cells = 2 * config.sectors
+        self._separate = config.sensor_counts == "separate"
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.int64]:
-        """Actions `[batch]` for counts `[batch, 2q]`."""
-        inner, ring = np.split(observation.astype(np.int64), [self._sectors], axis=1)
+        """Actions `[batch]` for counts `[batch, 2q]`, or `[batch, 4q]` apart; a goal's sector after them is ignored."""
+        counts = observation.astype(np.int64)
+        own, others = counts[:, : self._cells], counts[:, self._cells : 2 * self._cells]
+        inner, ring = np.split(own - others if self._separate else own, 2, axis=1)
         size = 2 * np.abs(ring).max(initial=0) + 1  # more than two rings can differ by
         return np.asarray(np.argmax(size * (inner + ring) + ring, axis=1), np.int64)
 

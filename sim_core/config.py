@@ -50,6 +50,10 @@ class WorldConfig:
     """tau, the size of the terminal reward (Table 3.2)."""
     reward_clock: Literal["step", "horizon"] = "step"
     """What the step reward tau/eta divides by: the current step (3.2.3) or the horizon (Table 3.2)."""
+    sensor_counts: Literal["difference", "separate"] = "difference"
+    """`sensor`: own-group less other-group robots a cell (3.2.1), or both counts apart (ours)."""
+    goal_in_state: bool = False
+    """`sensor`: also tells the sector in which the goal lies, as q zeros and ones (ours)."""
 
     outside_limit_steps: int = 100
     """`in`, `out`: phi, env steps outside the own ellipse, one after the other, that fail (not given in the text)."""
@@ -79,6 +83,8 @@ class WorldConfig:
     """`in`: a row's u_apf comes from its own group's robots, as the subscripts say, or from all robots in every row."""
     learner_speed_limit_m_s: float = 1.0
     """`out`: largest speed of the sum u_nn + u_apf (not given in the text)."""
+    ellipse_reward: Literal["signed", "penalty"] = "signed"
+    """`in`, `out`: +-tau/100 a step inside and outside (Table 4.1), or 0 inside, where it pays to linger (ours)."""
 
     time_step_s: float = 0.05
     """dt, simulated time per env step."""

@@ -63,6 +63,8 @@ class EnclosedParams(NamedTuple):
     horizon_steps: int
     timeout_fails: bool
     reward_scale: float
+    inside_reward: float
+    outside_reward: float
 
 
 @kernel
@@ -139,8 +141,7 @@ def _reward(state, outcome, out, params):
     p = params[0]
     for world in range(out.shape[0]):
         if outcome[world] == _RUNNING or (outcome[world] == _TIMEOUT and not p.timeout_fails):
-            share = p.reward_scale / STEP_REWARD_SHARE
-            reward = share if state.outside_steps[world] == 0 else -share
+            reward = p.inside_reward if state.outside_steps[world] == 0 else p.outside_reward
         else:
             reward = p.reward_scale if outcome[world] == _GOAL else -p.reward_scale
         out[world] = reward
@@ -174,7 +175,7 @@ class EnclosedMethod(Method):
         self.observation_limit = observation_limit(config)
         self._order = np.zeros(config.groups, np.int32)
         self._distance_sq = np.zeros(config.groups, np.float64)
-        real = np.float32
+        real, share = np.float32, config.reward_scale / STEP_REWARD_SHARE
         self._params = packed(
             EnclosedParams(
                 ellipse=ellipse_params(config),
@@ -193,6 +194,8 @@ class EnclosedMethod(Method):
                 horizon_steps=config.horizon_steps,
                 timeout_fails=config.timeout_fails,
                 reward_scale=float(config.reward_scale),
+                inside_reward=share if config.ellipse_reward == "signed" else 0.0,
+                outside_reward=-share,
             )
         )
 
@@ -205,5 +208,5 @@ class EnclosedMethod(Method):
         _outcome(state, out, self._params)
 
     def reward(self, state: WorldState, outcome: NDArray[np.int8], out: NDArray[np.float32]) -> None:
-        """Table 4.1: +tau/100 inside the own ellipse, -tau/100 outside, +-tau at the end."""
+        """Table 4.1: +tau/100 (or 0, `ellipse_reward`) inside the own ellipse, -tau/100 outside, +-tau at the end."""
         _reward(state, outcome, out, self._params)

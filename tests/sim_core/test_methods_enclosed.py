@@ -201,6 +201,14 @@ def test_table_4_1_step_by_step(method, make_state):
         assert state.episode_return[0] == pytest.approx(total)
 
 
+@pytest.mark.parametrize("method", METHOD_NAMES)
+def test_a_penalty_alone_gives_nothing_inside(method, make_state):
+    config, state = scene(make_state, (0, 0), AWAY, method, reward_scale=3.0, ellipse_reward="penalty")
+    assert step(config, state) == (Outcome.RUNNING, 0)
+    state.pos_x[0, 0] = REACH + 0.01
+    assert step(config, state) == (Outcome.RUNNING, pytest.approx(-0.03))
+
+
 @pytest.mark.parametrize(
     ("at", "others", "expected"),
     [

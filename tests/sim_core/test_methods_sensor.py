@@ -1,5 +1,6 @@
 """M_sensor: perception by brute force, Eq. 3.3 and 3.4, Table 3.1 and the outcomes with their clock."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -49,6 +50,32 @@ def test_perception_matches_brute_force(sectors, make_state):
             compared += 1
             assert observe(config, make_state(config, pos, np.zeros((3, 2)), learner=learner)).tolist() == counts
     assert compared > 30
+
+
+@pytest.mark.parametrize("sectors", [2, 3, 8])
+def test_counts_apart_are_what_the_difference_is_of(sectors, make_state):
+    config = WorldConfig(robots=10, groups=3, sectors=sectors)
+    apart = dataclasses.replace(config, sensor_counts="separate")
+    rng = np.random.default_rng(sectors)
+    for _ in range(20):
+        pos, learner = rng.uniform(-1.6, 1.6, (30, 2)).astype(REAL), int(rng.integers(30))
+        state = make_state(config, pos, np.zeros((3, 2)), learner=learner)
+        own, others = observe(apart, state).reshape(2, 2 * sectors)
+        assert (own - others).tolist() == observe(config, state).tolist()
+        dist_sq = ((np.delete(pos, learner, axis=0) - pos[learner]) ** 2).sum(axis=1)
+        mates = np.delete(np.arange(30), learner) // 10 == learner // 10
+        assert (own.sum(), others.sum()) == tuple((dist_sq[part] < 1.5**2).sum() for part in (mates, ~mates))
+
+
+@pytest.mark.parametrize("counts", ["difference", "separate"])
+@pytest.mark.parametrize(("learner", "goal", "sector"), [(0, (3, 1), 2), (0, (-3, -1), 0), (3, (-1, 9), 3)])
+def test_the_goal_is_told_by_its_sector(counts, learner, goal, sector, make_state):
+    config = WorldConfig(robots=3, groups=2, sectors=4, sensor_counts=counts)
+    goals = [goal, (-goal[0], -goal[1])] if learner == 0 else [(-goal[0], -goal[1]), goal]
+    state = make_state(config, np.zeros((6, 2)), goals, learner=learner)
+    told = observe(dataclasses.replace(config, goal_in_state=True), state)
+    assert told[:-4].tolist() == observe(config, state).tolist()
+    assert told[-4:].tolist() == np.eye(4, dtype=int)[sector].tolist()
 
 
 def test_perception_by_hand(make_state):
