@@ -15,6 +15,10 @@ from typing import Any, NamedTuple, get_type_hints
 from sim_core.checks import ConfigError
 from sim_core.outcomes import ENDED, Outcome
 
+ROBOTS = (5, 10, 15, 20, 25)
+"""Robots per group of the dissertation's setups (3.3)."""
+GROUPS = (1, 2, 3, 4, 8)
+"""Group counts of the dissertation's setups (3.3)."""
 LEARNED = "learned"
 """`policy` of a trained network; baselines go by their own names."""
 

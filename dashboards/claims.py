@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 from actors.estimates import rate
+from actors.result_table import GROUPS, ROBOTS
 from dashboards.claim_checks import (
     ABOUT_FAILURE,
     FAST,
@@ -33,9 +34,7 @@ from dashboards.claim_checks import (
     rises,
 )
 from dashboards.pooled import (
-    GROUPS,
     METHOD_NAMES,
-    ROBOTS,
     SETUPS,
     Cell,
     Measured,
@@ -147,7 +146,7 @@ def _failure_causes(results: Results) -> list[Check]:
         *_grows("captured", taken, robots),
         rises("lost 5r less 10r", difference(gone[5], gone[10])),
         alike("lost 10r → 15r", difference(gone[15], gone[10])),
-        rises("lost 15r → 25r", difference(gone[25], gone[15])),
+        *_grows("lost", [gone[n] for n in ROBOTS[2:]], robots[2:]),
         alike("lost less captured at 8g", over_robots(results, "sensor", GROUPS[-1], Cell.lost_less_captured)),
     ]
 

@@ -15,14 +15,10 @@ import numpy as np
 
 from actors import estimates
 from actors.estimates import Estimate
-from actors.result_table import LEARNED, ResultRow
+from actors.result_table import GROUPS, LEARNED, ROBOTS, ResultRow
 from sim_core.checks import require
 from sim_core.outcomes import Outcome
 
-ROBOTS = (5, 10, 15, 20, 25)
-"""Robots per group of the dissertation's setups."""
-GROUPS = (1, 2, 3, 4, 8)
-"""Their groups."""
 METHOD_NAMES = {"sensor": "M_sensor", "in": "M_IN", "out": "M_OUT"}
 """The methods by their name in a table; printed in this order."""
 NUM_CELLS = len(METHOD_NAMES) * len(ROBOTS) * len(GROUPS)

@@ -14,13 +14,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from actors.result_table import GROUPS, ROBOTS
 from dashboards.bars import Panel, Series, draw_bars, draw_lines, legend
 from dashboards.curve import FAILURE_STYLES
 from dashboards.pictures import MUTED, TEXT, new_figure
 from dashboards.pooled import (
-    GROUPS,
     METHOD_NAMES,
-    ROBOTS,
     Measure,
     Measured,
     Results,

@@ -16,8 +16,9 @@ import tyro  # noqa: E402
 
 from deploy.options import Command, Evaluate, Report, Resume, Sweep, Train, Watch  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
-from learner.presets import MethodName, PresetName, preset_config  # noqa: E402
+from learner.presets import PresetName, preset_config  # noqa: E402
 from sim_core.checks import ConfigError, require  # noqa: E402
+from sim_core.config import MethodName  # noqa: E402
 
 BAD_INPUT = 2
 INTERRUPTED = 130

@@ -13,6 +13,7 @@ from learner.config import RunConfig
 from learner.presets import PresetName
 from learner.sweep import SweepConfig
 from sim_core.checks import require
+from sim_core.config import MethodName
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +119,7 @@ class Evaluate:
     """Episodes to play."""
     first_seed: int = 2_000_000_000
     """Seed of the first episode; the others count on."""
-    method: Literal["sensor", "in", "out"] | None = None
+    method: MethodName | None = None
     """Baselines only: method of the world to play in; sensor by default."""
     preset: PresetName | None = None
     """Baselines only: settings of the world to play in, those of `shoal sweep`; the defaults otherwise."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +17,7 @@ from actors.trajectory import save_episodes
 from actors.vector_env import EnvSpec, env_shape
 from dashboards.strip import episode_strip_png
 from deploy.artifacts import foreign_animation, write_player, write_video
+from deploy.folders import make_folder
 from deploy.options import Evaluate, Watch, ray_address
 from deploy.tables import evaluation_table
 from learner.checkpoint import newest_valid
@@ -28,7 +28,7 @@ from learner.ray_edge import evaluate_in_tasks
 from learner.results import summarise
 from learner.run_folder import RunFolder, find_run
 from sim_core import ENV_ID
-from sim_core.checks import ConfigError, require
+from sim_core.checks import require
 from sim_core.config import WorldConfig
 from sim_core.outcomes import OUTCOME_NAMES
 
@@ -117,11 +117,7 @@ def _check_outputs(out: Path, record: int, spec: EnvSpec) -> None:
     if record:
         require(spec.is_swarm, f"--record applies to our own environment, not to {spec.env_id}")
         refuse_existing(episodes_path(out))
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--out {out} cannot be written ({error}); name a folder that you may write to") from error
-    require(os.access(out.parent, os.W_OK), f"--out {out} cannot be written; name a folder that you may write to")
+    make_folder(out.parent, "the folder of --out,")
 
 
 def _record(out: Path, entry: Entry, seeds: list[int]) -> None:

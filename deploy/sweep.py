@@ -47,11 +47,16 @@ class SweepResults:
         self.cells = make_cells(grid)  # refuses what cannot be, before a folder is made
         make_folder(folder, "--runs-dir")
         self._known = [*known, *(read_table(self.table) if self.table.is_file() else [])]
+        self._own = {cell.key: self._read(cell.key) for cell in self.cells}
         self._commit = git_commit()
+
+    def _read(self, key: str) -> list[ResultRow]:
+        table = self.folder / CELLS / key / RESULTS
+        return read_table(table) if table.is_file() else []
 
     def _rows(self) -> list[ResultRow]:
         """All rows: of two of the same evaluation the one of more episodes, none of a cell's former settings."""
-        own = [row for path in sorted((self.folder / CELLS).glob(f"*/{RESULTS}")) for row in read_table(path)]
+        own = [row for rows in self._own.values() for row in rows]
         newest = {_place(cell, self._grid): cell_hash(cell.config) for cell in self.cells}
         best: dict[tuple[object, ...], ResultRow] = {}
         for row in sorted([*self._known, *own], key=lambda row: row.episodes):
@@ -59,6 +64,11 @@ class SweepResults:
             if newest.get(trained, row.config) == row.config:
                 best[*trained, row.robots, row.groups] = row
         return list(best.values())
+
+    def finished(self, key: str) -> dict[str, list[ResultRow]]:
+        """Reads the table of a cell that has just finished, and writes all; see `write`."""
+        self._own[key] = self._read(key)
+        return self.write()
 
     def write(self) -> dict[str, list[ResultRow]]:
         """Writes `results.csv`, all rows of the sweep's sittings, and `settings.json`, how the last came about.
@@ -108,7 +118,7 @@ class _Listener:
         self._board.progressed(key, env_steps)
 
     def finished(self, key: str) -> None:
-        done = self._results.write()
+        done = self._results.finished(key)
         if key in done:
             self._board.finished(key, done[key])
         else:

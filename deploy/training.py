@@ -9,6 +9,7 @@ import signal
 
 from rich.console import Console
 
+from actors.baselines import Baseline
 from actors.vector_env import env_shape
 from deploy.artifacts import log_artifacts
 from deploy.folders import check_plain_name, make_folder
@@ -40,6 +41,7 @@ def train(command: Train) -> int:
     config, launch = command.run, command.launch
     if launch.name is not None:
         check_plain_name(launch.name)
+        require(launch.name not in list(Baseline), f"--name {launch.name} is that of a baseline; choose another")
     folder = _new_folder(config, launch)
     make_folder(launch.runs_dir, "--runs-dir")
     env_shape(config.env)  # refuses an environment that cannot be made

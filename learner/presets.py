@@ -19,10 +19,9 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from learner.config import RunConfig
-from sim_core.config import WorldConfig
+from sim_core.config import MethodName, WorldConfig
 
 PresetName = Literal["thesis", "best"]
-MethodName = Literal["sensor", "in", "out"]
 
 _COMMON: dict[str, Any] = {
     "total_env_steps": 1_000_000,

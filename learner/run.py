@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -133,8 +132,7 @@ def execute(
             cluster.close()  # not after an error: references in its traceback must not outlive Ray, which ends at exit
             if result.evaluation is not None:
                 rows = journal.rows()
-                time_ms = rows[-1].time_ms if rows else int(time.time() * 1000)
-                tracker.final(final_metrics(result.evaluation), time_ms)
+                tracker.final(final_metrics(result.evaluation), rows[-1].time_ms if rows else tracker.started_ms)
                 finish(result, rows)
         status = "FINISHED" if result.stopped_by is None else "KILLED"
         return result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import tomllib
@@ -10,17 +11,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
-from actors.result_table import LEARNED, ResultRow
+from actors.result_table import GROUPS, LEARNED, ROBOTS, ResultRow
 from learner.config import RunConfig, to_dict
-from learner.presets import MethodName, PresetName, preset_config
+from learner.presets import PresetName, preset_config
 from sim_core.checks import check_fields, require
-from sim_core.config import WorldConfig
+from sim_core.config import MethodName, WorldConfig
 
 BaselineName = Literal["fl-orca", "greedy", "random"]
-ROBOTS = (5, 10, 15, 20, 25)
-"""Robots per group of the dissertation's setups (3.3)."""
-GROUPS = (1, 2, 3, 4, 8)
-"""Group counts of the dissertation's setups (3.3)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,6 +133,7 @@ class Cell(NamedTuple):
         return played + (self.config.total_env_steps * (robots + 60.0) if self.policy == LEARNED else 0.0)
 
 
+@functools.lru_cache(maxsize=4096)  # a table of results asks for the same ones after every cell
 def cell_hash(config: RunConfig) -> str:
     """Twelve hex digits of all that decides a cell's results; unlike `config_hash`, the training's length counts.
 

@@ -9,6 +9,8 @@ import os
 import socket
 import subprocess
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -78,6 +80,8 @@ class Tracker:
         check_reachable(uri)
         self.uri = uri
         self.run_id = ""
+        self.started_ms = 0
+        """When the run began."""
         try:
             self._client = mlflow.MlflowClient(uri)
             found = self._client.get_experiment_by_name(experiment)
@@ -102,7 +106,7 @@ class Tracker:
             "mlflow.source.git.commit": git_commit(),
         }
         run = self._client.create_run(self._experiment_id, tags={"mlflow.runName": config.name} | known | (tags or {}))
-        self.run_id = run.info.run_id
+        self.run_id, self.started_ms = run.info.run_id, run.info.start_time
         self.log_params(config)
 
     def log_params(self, config: RunConfig) -> None:
@@ -110,10 +114,11 @@ class Tracker:
         params = [Param(key, str(value)) for key, value in flat_params(config).items()]
         self._client.log_batch(self.run_id, params=params)
 
-    def find_run(self, tag: str, value: str) -> str | None:
-        """Id of the experiment's oldest run whose `tag` is `value`; None if there is none."""
+    def find_run(self, tags: dict[str, str]) -> str | None:
+        """Id of the experiment's oldest run that has all `tags`; None if there is none."""
+        has_all = " and ".join(f"tags.`{name}` = '{value}'" for name, value in tags.items())
         found = self._client.search_runs(
-            [self._experiment_id], f"tags.`{tag}` = '{value}'", max_results=1, order_by=["attributes.start_time ASC"]
+            [self._experiment_id], has_all, max_results=1, order_by=["attributes.start_time ASC"]
         )
         return found[0].info.run_id if found else None
 
@@ -124,14 +129,15 @@ class Tracker:
           ConfigError: the store does not know it.
         """
         try:
-            attempts = int(self._client.get_run(run_id).data.tags.get("attempts", "1"))
+            run = self._client.get_run(run_id)
+            attempts = int(run.data.tags.get("attempts", "1"))
             self._client.update_run(run_id, status="RUNNING")
             self._client.log_batch(run_id, tags=[RunTag("attempts", str(attempts + 1))])
         except MlflowException as error:
             raise ConfigError(
                 f"the MLflow store {self.uri} does not know run {run_id}; name the store it was logged to"
             ) from error
-        self.run_id = run_id
+        self.run_id, self.started_ms = run_id, run.info.start_time
 
     def push(self, rows: list[Row]) -> None:
         """Mirrors journal rows; a row that is there already is stored once."""
@@ -145,7 +151,7 @@ class Tracker:
             self._client.log_batch(self.run_id, metrics=metrics[start : start + MAX_BATCH])
 
     def final(self, metrics: dict[str, float], time_ms: int) -> None:
-        """Logs the run's results at step 0, where the UI draws them as bars."""
+        """Logs the run's results at step 0, where the UI draws them as bars; the same of the same time only once."""
         self.push([Row(0, time_ms, {f"final/{key}": value for key, value in metrics.items()})])
 
     def log_policy(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> None:
@@ -181,6 +187,16 @@ class Tracker:
                 self._client.set_experiment_tag(self._experiment_id, TAG + key, packed_view(name, state, now_ms))
             except MlflowException as error:
                 logging.getLogger(__name__).warning("no MLflow view %r: %s", name, str(error).splitlines()[0])
+
+    @contextmanager
+    def ending(self) -> Iterator[None]:
+        """Closes the run after the block: FINISHED, or FAILED by an error that passes on."""
+        status = "FAILED"
+        try:
+            yield
+            status = "FINISHED"
+        finally:
+            self.end(status)
 
     def end(self, status: str) -> None:
         """Closes the run as FINISHED, KILLED or FAILED."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -43,6 +42,11 @@ class SweepPlace(NamedTuple):
     cells: Path
     tracking_uri: str
     experiment: str
+
+    @property
+    def sweep(self) -> str:
+        """The sweep's name: that of the folder which holds its cells."""
+        return self.cells.parent.name
 
 
 class RowDisplay:
@@ -86,12 +90,12 @@ def result_row(sweep: SweepConfig, cell: Cell, played: WorldConfig, stats: Episo
 def _start_or_find(cell: Cell, sweep: SweepConfig, folder: RunFolder, place: SweepPlace) -> Tracker:
     """The cell's MLflow run: that of its folder, or one that carries its key, or a new one."""
     tracker = Tracker(place.tracking_uri, place.experiment, None)
-    known = tracker.find_run("cell", cell.key)
+    known = tracker.find_run({"cell": cell.key, "sweep": place.sweep})
     if known:
         tracker.resume(known)
         tracker.log_params(cell.config)  # which a kill may have kept from it
     else:
-        tracker.start(cell.config, _tags(cell, sweep))
+        tracker.start(cell.config, {"sweep": place.sweep} | _tags(cell, sweep))
     folder.save_config(cell.config)
     folder.save_identity(RunIdentity(cell.name, tracker.uri, place.experiment, tracker.run_id))
     return tracker
@@ -131,11 +135,13 @@ def run_cell(sweep: SweepConfig, cell: Cell, place: SweepPlace, on_row: Callable
         return folder.results
     tracker = _start_or_find(cell, sweep, folder, place)
     if cell.policy != LEARNED:
-        _play_baseline(sweep, cell, folder, tracker)
+        with tracker.ending():
+            _play_baseline(sweep, cell, folder, tracker)
     elif folder.policy.is_file() and not folder.checkpoints.exists():
-        _play_again(sweep, cell, folder, tracker)
+        with tracker.ending():
+            _play_again(sweep, cell, folder, tracker)
     else:
-        _train(sweep, cell, folder, tracker, on_row)
+        _train(sweep, cell, folder, tracker, on_row)  # ends its MLflow run itself
     _new_table(folder).rename(folder.results)  # once MLflow has all and its run is closed
     shutil.rmtree(folder.checkpoints, ignore_errors=True)  # the policy and the results stay
     return folder.results
@@ -164,15 +170,13 @@ def _play_again(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Trac
     weights = read_saved_policy(folder.policy, cell.config, env_shape(cell.config.env))
     fixed = evaluate(cell.config.env, weights, _fixed_seeds(cell))
     _log_table(_evaluate_all(sweep, cell, folder, weights, fixed), folder, tracker)
-    tracker.end("FINISHED")
 
 
 def _play_baseline(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker) -> None:
     """Plays a baseline's episodes, of which there is nothing to resume."""
     stats = evaluate(cell.config.env, Baseline(cell.policy), _fixed_seeds(cell))
-    tracker.final(final_metrics(summarise(stats)), int(time.time() * 1000))
+    tracker.final(final_metrics(summarise(stats)), tracker.started_ms)
     _log_table([_stored(sweep, cell, cell.config, stats, folder, 0)], folder, tracker)
-    tracker.end("FINISHED")
 
 
 def _log_table(results: list[ResultRow], folder: RunFolder, tracker: Tracker) -> None:

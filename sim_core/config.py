@@ -13,6 +13,8 @@ from typing import Literal
 from sim_core.checks import check_fields, require
 
 MAX_HEADINGS = 64
+MethodName = Literal["sensor", "in", "out"]
+"""State representations: M_sensor (Chapter 3), M_IN and M_OUT (Chapter 4)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +29,7 @@ class WorldConfig:
     """Robots per group, the 10 of 10r x 2g; the learning robot counts."""
     groups: int = 2
     """Number of groups, the 2 of 10r x 2g."""
-    method: Literal["sensor", "in", "out"] = "sensor"
+    method: MethodName = "sensor"
     """State representation of the learning robot: M_sensor (Chapter 3), M_IN or M_OUT (Chapter 4)."""
     swarm_knows_learner: Literal["method", "yes", "no"] = "method"
     """Whether the swarm avoids the learning robot and counts it in its flock (the method's: M_sensor only)."""

@@ -46,6 +46,7 @@ def free_port() -> int:
         (["--env-id", "NoSuchEnv-v0"], ["env_id", "NoSuchEnv"]),
         (["--env-id", "Pendulum-v1"], ["env_id", "Discrete"]),
         (["--name", "../up"], ["--name", "plain folder name"]),
+        (["--name", "greedy"], ["--name greedy", "a baseline", "choose another"]),
         (["--config", "missing.toml"], ["--config", "missing.toml", "cannot be read"]),
         (["--config", "missing.toml", "--preset", "best"], ["--config", "--preset", "leave one"]),
         (["--preset", "ours"], ["--preset", "thesis", "best"]),

@@ -104,6 +104,32 @@ def test_a_baselines_cell_counts_its_episodes(store, cell, tmp_path):
     assert runs[0].data.metrics["final/success_rate"] == rows[0].goal / 40
 
 
+def test_a_baselines_cell_that_failed_is_played_again_in_its_run(store, cell, tmp_path, monkeypatch):
+    cell = Cell("greedy-again", cell.config, "greedy")
+    place = SweepPlace(tmp_path / "sweep" / "cells", store, "cells")
+
+    def fail(*arguments):
+        raise Crash
+
+    with monkeypatch.context() as patch:
+        patch.setattr("learner.trial._log_table", fail)  # after its results were logged
+        with pytest.raises(Crash):
+            run_cell(SWEEP, cell, place, id)
+    assert [run.info.status for run in runs_of(store, cell)[1]] == ["FAILED"]
+    run_cell(SWEEP, cell, place, id)
+    client, runs = runs_of(store, cell)
+    assert [run.info.status for run in runs] == ["FINISHED"]
+    assert len(client.get_metric_history(runs[0].info.run_id, "final/success_rate")) == 1
+
+
+def test_two_sweeps_in_one_experiment_keep_apart(store, cell, tmp_path):
+    cell = Cell("greedy-twice", cell.config, "greedy")
+    for sweep in ("one", "two", "one"):
+        shutil.rmtree(tmp_path / sweep, ignore_errors=True)
+        run_cell(SWEEP, cell, SweepPlace(tmp_path / sweep / "cells", store, "cells"), id)
+    assert sorted(run.data.tags["sweep"] for run in runs_of(store, cell)[1]) == ["one", "two"]
+
+
 def test_a_finished_cell_of_which_more_is_wanted_plays_its_policy_again(store, cell, tmp_path):
     cell = cell._replace(key=f"{cell.key}-more")
     place = SweepPlace(tmp_path, store, "cells")
