@@ -6,16 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def mean_pairwise_distances_m(pos: NDArray[np.floating], groups: int) -> NDArray[np.float64]:
+def mean_pairwise_distances_m(pos: NDArray[np.floating], groups: int, count_self: bool = True) -> NDArray[np.float64]:
     """Mean distance d_XY between the robots of every two groups (Eq. 3.1).
 
     Args:
       pos: `[..., num_robots, 2]`, metres; groups are equal contiguous blocks of robots.
       groups: number of groups.
+      count_self: whether d_XX counts each robot's zero distance to itself, as printed, or only i != j (nan for
+        groups of one robot).
 
     Returns:
-      `[..., groups, groups]` float64, metres. The diagonal is d_XX, where, as in the equation, each
-      robot's zero distance to itself counts. Read so, 2 d_XY - d_XX - d_YY is never negative (it is the
+      `[..., groups, groups]` float64, metres; d_XX on the diagonal. As printed, 2 d_XY - d_XX - d_YY is never negative (it is the
       energy distance of the two groups), so that groups of equal spread count as segregated even when mixed.
     """
     points = np.asarray(pos, np.float64)
@@ -24,20 +25,24 @@ def mean_pairwise_distances_m(pos: NDArray[np.floating], groups: int) -> NDArray
     size = points.shape[-2] // groups
     blocks = distance.reshape(*distance.shape[:-2], groups, size, groups, size)
     means: NDArray[np.float64] = blocks.mean(axis=(-3, -1))
+    if not count_self:
+        own = np.arange(groups)
+        means[..., own, own] *= size / (size - 1) if size > 1 else np.nan
     return means
 
 
-def segregated_fraction(pos: NDArray[np.floating], groups: int) -> NDArray[np.float64]:
+def segregated_fraction(pos: NDArray[np.floating], groups: int, count_self: bool = True) -> NDArray[np.float64]:
     """Share of group pairs X != Y with d_XX < d_XY and d_YY < d_XY; 1 where there is one group.
 
     Args:
       pos: `[..., num_robots, 2]`, metres.
       groups: number of groups.
+      count_self: see `mean_pairwise_distances_m`; without it mixed groups of equal spread are not segregated.
 
     Returns:
       `[...]` float64 in [0, 1]; 1 means that all groups are segregated.
     """
-    mean = mean_pairwise_distances_m(pos, groups)
+    mean = mean_pairwise_distances_m(pos, groups, count_self)
     if groups == 1:
         return np.ones(mean.shape[:-2])
     own = np.diagonal(mean, axis1=-2, axis2=-1)

@@ -47,6 +47,20 @@ def test_equation_3_1_cannot_tell_mixed_groups_of_equal_spread():
     assert segregated_fraction(np.concatenate([circle[::2], circle[1::2]]), 2) == 1.0
 
 
+def test_without_self_distances_mixed_groups_are_not_segregated():
+    rng = np.random.default_rng(0)
+    pos = rng.normal(0, 1, (300, 12, 2))
+    mean = mean_pairwise_distances_m(pos, 2, count_self=False)
+    for world in range(20):
+        for group, block in enumerate((pos[world, :6], pos[world, 6:])):
+            others = [np.hypot(*(block[i] - block[j])) for i in range(6) for j in range(6) if i != j]
+            assert mean[world, group, group] == pytest.approx(np.mean(others))
+    np.testing.assert_array_equal(mean[:, 0, 1], mean_pairwise_distances_m(pos, 2)[:, 0, 1])
+    assert segregated_fraction(pos, 2, count_self=False).mean() < 0.5 * segregated_fraction(pos, 2).mean()
+    assert (segregated_fraction(pos + 9 * (np.arange(12) < 6)[:, None], 2, count_self=False) == 1).all()
+    assert np.isnan(mean_pairwise_distances_m(pos[:, :2], 2, count_self=False)[:, 0, 0]).all()
+
+
 def test_self_distances_of_the_equation_favour_small_groups():
     # Eq. 3.1 as printed counts i = j: two robots of each group, wholly mixed, still pass (see the docstring).
     square = np.array([[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
