@@ -16,8 +16,9 @@ def mean_pairwise_distances_m(pos: NDArray[np.floating], groups: int, count_self
         groups of one robot).
 
     Returns:
-      `[..., groups, groups]` float64, metres; d_XX on the diagonal. As printed, 2 d_XY - d_XX - d_YY is never negative (it is the
-      energy distance of the two groups), so that groups of equal spread count as segregated even when mixed.
+      `[..., groups, groups]` float64, metres; d_XX on the diagonal. As printed, 2 d_XY - d_XX - d_YY is never
+      negative (it is the energy distance of the two groups), so that groups of equal spread count as segregated
+      even when mixed.
     """
     points = np.asarray(pos, np.float64)
     delta = points[..., :, None, :] - points[..., None, :, :]
