@@ -85,8 +85,8 @@ class WorldConfig:
     """`in`: a row's u_apf comes from its own group's robots, as the subscripts say, or from all robots in every row."""
     learner_speed_limit_m_s: float = 1.0
     """`out`: largest speed of the sum u_nn + u_apf (not given in the text)."""
-    ellipse_reward: Literal["signed", "penalty"] = "signed"
-    """`in`, `out`: +-tau/100 a step inside and outside (Table 4.1), or 0 inside, where it pays to linger (ours)."""
+    ellipse_reward: Literal["inside", "progress"] = "inside"
+    """`in`, `out`: a step's +tau/100 is for being inside (Table 4.1), or inside and closer to the goal (ours)."""
 
     time_step_s: float = 0.05
     """dt, simulated time per env step."""

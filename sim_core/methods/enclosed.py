@@ -30,6 +30,7 @@ from sim_core.methods.ellipse import (
     in_own_ellipse,
     left_out_of,
 )
+from sim_core.methods.progress import came_closer
 from sim_core.outcomes import Outcome, collision_or_goal, lost_or_captured
 from sim_core.packed import packed
 from sim_core.state import WorldState
@@ -63,8 +64,7 @@ class EnclosedParams(NamedTuple):
     horizon_steps: int
     timeout_fails: bool
     reward_scale: float
-    inside_reward: float
-    outside_reward: float
+    rewards_progress: bool
 
 
 @kernel
@@ -140,8 +140,11 @@ def _outcome(state, out, params):
 def _reward(state, outcome, out, params):
     p = params[0]
     for world in range(out.shape[0]):
+        closer = came_closer(state, world, p.ellipse.robots)
         if outcome[world] == _RUNNING or (outcome[world] == _TIMEOUT and not p.timeout_fails):
-            reward = p.inside_reward if state.outside_steps[world] == 0 else p.outside_reward
+            share = p.reward_scale / STEP_REWARD_SHARE
+            good = state.outside_steps[world] == 0 and (closer or not p.rewards_progress)
+            reward = share if good else -share
         else:
             reward = p.reward_scale if outcome[world] == _GOAL else -p.reward_scale
         out[world] = reward
@@ -175,7 +178,7 @@ class EnclosedMethod(Method):
         self.observation_limit = observation_limit(config)
         self._order = np.zeros(config.groups, np.int32)
         self._distance_sq = np.zeros(config.groups, np.float64)
-        real, share = np.float32, config.reward_scale / STEP_REWARD_SHARE
+        real = np.float32
         self._params = packed(
             EnclosedParams(
                 ellipse=ellipse_params(config),
@@ -194,8 +197,7 @@ class EnclosedMethod(Method):
                 horizon_steps=config.horizon_steps,
                 timeout_fails=config.timeout_fails,
                 reward_scale=float(config.reward_scale),
-                inside_reward=share if config.ellipse_reward == "signed" else 0.0,
-                outside_reward=-share,
+                rewards_progress=config.ellipse_reward == "progress",
             )
         )
 
@@ -208,5 +210,5 @@ class EnclosedMethod(Method):
         _outcome(state, out, self._params)
 
     def reward(self, state: WorldState, outcome: NDArray[np.int8], out: NDArray[np.float32]) -> None:
-        """Table 4.1: +tau/100 (or 0, `ellipse_reward`) inside the own ellipse, -tau/100 outside, +-tau at the end."""
+        """Table 4.1: +tau/100 inside the own ellipse (see `ellipse_reward`), -tau/100 outside, +-tau at the end."""
         _reward(state, outcome, out, self._params)

@@ -18,6 +18,7 @@ from sim_core.config import WorldConfig
 from sim_core.jit import kernel
 from sim_core.methods.base import Method
 from sim_core.methods.headings import heading_velocities, write_headings
+from sim_core.methods.progress import came_closer
 from sim_core.outcomes import Outcome, end_of_step
 from sim_core.packed import packed
 from sim_core.state import WorldState
@@ -113,13 +114,7 @@ def _outcome(state, out, params):
 def _reward(state, outcome, out, params):
     p = params[0]
     for world in range(out.shape[0]):
-        learner = state.learner[world]
-        group = learner // p.robots
-        dx = state.pos_x[world, learner] - state.goal_x[world, group]
-        dy = state.pos_y[world, learner] - state.goal_y[world, group]
-        distance_m = np.sqrt(dx * dx + dy * dy)
-        closer = distance_m < state.goal_distance_m[world]
-        state.goal_distance_m[world] = distance_m
+        closer = came_closer(state, world, p.robots)
         if outcome[world] == _RUNNING or (outcome[world] == _TIMEOUT and not p.timeout_fails):
             clock = state.steps[world] if p.clock_is_step else p.horizon_steps
             reward = p.reward_scale / clock if closer else -p.reward_scale / clock

@@ -202,11 +202,12 @@ def test_table_4_1_step_by_step(method, make_state):
 
 
 @pytest.mark.parametrize("method", METHOD_NAMES)
-def test_a_penalty_alone_gives_nothing_inside(method, make_state):
-    config, state = scene(make_state, (0, 0), AWAY, method, reward_scale=3.0, ellipse_reward="penalty")
-    assert step(config, state) == (Outcome.RUNNING, 0)
-    state.pos_x[0, 0] = REACH + 0.01
-    assert step(config, state) == (Outcome.RUNNING, pytest.approx(-0.03))
+def test_progress_is_rewarded_inside_only(method, make_state):
+    config, state = scene(make_state, (0, 0), AWAY, method, reward_scale=3.0, ellipse_reward="progress")
+    state.goal_x[0, 0], state.goal_y[0, 0], state.goal_distance_m[0] = 40.0, 0.0, 40.0
+    for x, reward in ((0.1, 0.03), (0.1, -0.03), (0.05, -0.03), (0.2, 0.03), (REACH + 0.01, -0.03), (0.3, -0.03)):
+        state.pos_x[0, 0] = x  # closer; as near; farther; closer; closer but outside; inside but farther
+        assert step(config, state) == (Outcome.RUNNING, pytest.approx(reward))
 
 
 @pytest.mark.parametrize(
