@@ -20,6 +20,16 @@ CLOCKED = ("speed/", "system/", "policy/staleness_s")
 """Metrics that depend on the clock."""
 
 
+OPTIONS = {
+    "replay": "prioritised",
+    "importance_exponent_env_steps": 5_000,
+    "network": "dueling",
+    "loss": "mse",
+    "target_update": "soft",
+    "learning_rate_schedule": "cosine",
+}
+
+
 class Silent:
     def row(self, row):
         pass
@@ -92,6 +102,15 @@ def test_no_checkpoint_is_written_twice(small, tmp_path):
     assert len(listing.steps) == len(set(listing.steps)) >= 2 and listing.steps[-1] >= small.total_env_steps
 
 
+@pytest.mark.parametrize("name", OPTIONS)
+def test_every_option_changes_what_is_learned(small, tmp_path, name):
+    replay = {"replay": "prioritised"} if name.startswith("importance") else {}
+    train(dataclasses.replace(small, **replay), tmp_path / "one")
+    train(dataclasses.replace(small, **replay, **{name: OPTIONS[name]}), tmp_path / "two")
+    one, two = (final_state(tmp_path / folder)[0]["learner/online.layers.0.weight"] for folder in ("one", "two"))
+    assert one.shape != two.shape or not np.array_equal(one, two)
+
+
 def test_another_seed_is_another_run(small, tmp_path):
     train(small, tmp_path / "one")
     train(dataclasses.replace(small, seed=1), tmp_path / "two")
@@ -99,9 +118,10 @@ def test_another_seed_is_another_run(small, tmp_path):
     assert not np.array_equal(one["learner/online.layers.0.weight"], two["learner/online.layers.0.weight"])
 
 
+@pytest.mark.parametrize("options", [{}, OPTIONS], ids=["defaults", "options"])
 @pytest.mark.parametrize("shards", [1, 3])
-def test_a_run_resumed_in_a_new_process_is_the_uninterrupted_one(small, shoal, tmp_path, shards):
-    whole = dataclasses.replace(small, replay_shards=shards, workers=2, replay_capacity=4_200)
+def test_a_run_resumed_in_a_new_process_is_the_uninterrupted_one(small, shoal, tmp_path, shards, options):
+    whole = dataclasses.replace(small, replay_shards=shards, workers=2, replay_capacity=4_200, **options)
     half = dataclasses.replace(whole, total_env_steps=3_072)
     train(whole, tmp_path / "whole")
 
