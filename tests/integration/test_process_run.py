@@ -47,9 +47,13 @@ class Listing(Silent):
 
 
 def train(config, folder: Path, observer=None) -> None:
-    cluster = process_cluster(config, 0)
-    with closing(Journal(folder / "metrics.jsonl", 0)) as journal:
+    """Trains to the end, from the newest checkpoint in the folder if there is one."""
+    saved = newest_valid(folder / "checkpoints")[0] if (folder / "checkpoints").exists() else None
+    cluster = process_cluster(config, saved.state["incarnation"] + 1 if saved else 0)
+    with closing(Journal(folder / "metrics.jsonl", saved.state["journal_offset"] if saved else 0)) as journal:
         loop = TrainingLoop(config, cluster, journal, folder / "checkpoints", observer or Silent(), bool)
+        if saved:
+            loop.restore(saved)
         assert loop.run()
 
 
@@ -118,10 +122,20 @@ def test_another_seed_is_another_run(small, tmp_path):
     assert not np.array_equal(one["learner/online.layers.0.weight"], two["learner/online.layers.0.weight"])
 
 
-@pytest.mark.parametrize("options", [{}, OPTIONS], ids=["defaults", "options"])
 @pytest.mark.parametrize("shards", [1, 3])
-def test_a_run_resumed_in_a_new_process_is_the_uninterrupted_one(small, shoal, tmp_path, shards, options):
-    whole = dataclasses.replace(small, replay_shards=shards, workers=2, replay_capacity=4_200, **options)
+def test_a_resumed_run_with_every_option_is_the_uninterrupted_one(small, tmp_path, shards):
+    whole = dataclasses.replace(small, replay_shards=shards, workers=2, replay_capacity=4_200, **OPTIONS)
+    train(whole, tmp_path / "whole")
+    train(dataclasses.replace(whole, total_env_steps=3_072), tmp_path / "halves")
+    train(whole, tmp_path / "halves")
+    halves = final_state(tmp_path / "halves")
+    assert "shard-0-priorities/priority" in halves[0]
+    assert_same(final_state(tmp_path / "whole"), halves)
+
+
+@pytest.mark.parametrize("shards", [1, 3])
+def test_a_run_resumed_in_a_new_process_is_the_uninterrupted_one(small, shoal, tmp_path, shards):
+    whole = dataclasses.replace(small, replay_shards=shards, workers=2, replay_capacity=4_200)
     half = dataclasses.replace(whole, total_env_steps=3_072)
     train(whole, tmp_path / "whole")
 
