@@ -70,6 +70,7 @@ class Learner:
         self._gradients = GRADIENTS[settings.gradients](self._online, self._target, settings.double, settings.loss)
         self.optimiser = torch.optim.Adam([self._online.values], fused=True)
         self.updates = 0
+        self._columns = Columns()
         self.td_errors = np.zeros(0, np.float32)
 
     def update(
@@ -84,7 +85,7 @@ class Learner:
         """
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate
-        columns = {name: column.to(self.device) for name, column in column_tensors(rows).items()}
+        columns = {name: column.to(self.device) for name, column in self._columns(rows).items()}
         if weights is not None:
             columns["weight"] = torch.from_numpy(weights).to(self.device)
         size = self._settings.batch_size
@@ -164,10 +165,21 @@ def _part(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
 
 
-def column_tensors(rows: NDArray[Any]) -> dict[str, Tensor]:
-    """Columns of packed rows as tensors: observations and rewards float32, actions int64."""
-    columns = {name: torch.from_numpy(rows[name].astype(np.float32)) for name in ("reward", "discount")}
-    columns["action"] = torch.from_numpy(rows["action"].astype(np.int64))
-    for name in ("observation", "next_observation"):
-        columns[name] = torch.from_numpy(rows[name].astype(np.float32))
-    return columns
+class Columns:
+    """Columns of packed rows as tensors: observations, rewards and discounts float32, actions int64.
+
+    Calls with as many rows share their memory: the tensors of one are overwritten by the next. A super-batch is
+    megabytes, and to give memory back and take it anew with every call costs more than what is written to it.
+    """
+
+    def __init__(self) -> None:
+        self._tensors: dict[str, Tensor] = {}
+
+    def __call__(self, rows: NDArray[Any]) -> dict[str, Tensor]:
+        """The columns of `rows`, `[count, ...]` each."""
+        if not self._tensors or len(self._tensors["action"]) != len(rows):
+            dtypes = {name: torch.int64 if name == "action" else torch.float32 for name in rows.dtype.names or ()}
+            self._tensors = {name: torch.empty(rows[name].shape, dtype=dtype) for name, dtype in dtypes.items()}
+        for name, tensor in self._tensors.items():
+            np.copyto(tensor.numpy(), rows[name], casting="unsafe")
+        return dict(self._tensors)

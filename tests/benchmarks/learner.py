@@ -11,7 +11,7 @@ from rich.table import Table
 from actors.network import QNetwork
 from actors.transitions import transition_dtype
 from learner.double_dqn import as_batch, mean_loss, targets
-from learner.learner import Learner, LearnerSettings, column_tensors
+from learner.learner import Columns, Learner, LearnerSettings
 from tests.benchmarks.timing import rates, ratio, spread
 
 SHAPES = (((16, 64, 64, 8), 64), ((16, 64, 64, 8), 256), ((16, 128, 128, 8), 256), ((72, 128, 128, 9), 256))
@@ -59,10 +59,11 @@ def plain_work(rows: np.ndarray, sizes: tuple[int, ...], batch: int):
     """What a reader of a textbook would write: autograd, fused Adam, gradients clipped."""
     online = QNetwork(sizes[0], sizes[1:-1], sizes[-1])
     target = copy.deepcopy(online)
+    columns_of = Columns()
     optimiser = torch.optim.Adam(online.parameters(), lr=RATE, fused=True)
 
     def work() -> int:
-        columns = column_tensors(rows)
+        columns = columns_of(rows)
         for start in range(0, len(rows), batch):
             part = as_batch(columns, slice(start, start + batch))
             loss, _ = mean_loss(online(part.s_tm1), part.a_tm1, targets(part, online, target, True))

@@ -1,9 +1,10 @@
 """Million transitions per CPU second into and out of one replay shard, beside the buffers of other projects.
 
 CPU time of the process counts, all threads together, so that other work on the machine does not. Observations are 72
-float32. A draw ends where an update begins: each column contiguous, in the learner's dtypes, and for prioritised draws
-with importance weights. Peers come with the extra `peers`; one that is not installed, or cannot do its part with the
-PyTorch that is, is named and left out.
+float32. A block comes as each buffer likes it best: in packed rows for ours, as rollout workers push it, in columns for
+the others. A draw ends where an update begins: each column contiguous, in the learner's dtypes, and for prioritised
+draws with importance weights. Peers come with the extra `peers`; one that is not installed, or cannot do its part with
+the PyTorch that is, is named and left out.
 """
 
 import importlib.util
@@ -23,7 +24,7 @@ from actors.prioritised import PrioritySettings
 from actors.rollout import join_stats
 from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
 from learner.double_dqn import importance_weights
-from learner.learner import column_tensors
+from learner.learner import Columns
 from tests.benchmarks.timing import ratio, spread, stopwatch, timed_rates
 
 SPACE = Box(-np.inf, np.inf, (72,), np.float32)
@@ -51,7 +52,7 @@ def shoal_rival(prioritised: bool) -> Rival:
     priorities = PrioritySettings(ALPHA, BATCH) if prioritised else None
     shard = make_shard(ShardSettings(transition_dtype(SPACE), CAPACITY, 0, priorities))
     rows, episodes = np.zeros(BLOCK, transition_dtype(SPACE)), join_stats([])
-    sequence = iter(range(10**9))
+    sequence, columns_of = iter(range(10**9)), Columns()
 
     def add() -> None:
         header = BlockHeader(SCHEMA_VERSION, 0, 0, next(sequence), 0, 0.0, 0.0, BLOCK)
@@ -59,7 +60,7 @@ def shoal_rival(prioritised: bool) -> Rival:
 
     def draw(count: int) -> object:
         reply = shard.sample(count)
-        column_tensors(reply.rows)
+        columns_of(reply.rows)
         if reply.draws is None:
             return None
         importance_weights(reply.draws.probability, BATCH, BETA)

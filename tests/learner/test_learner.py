@@ -9,10 +9,11 @@ import torch
 
 from actors.network import Policy
 from actors.transitions import transition_dtype
-from learner.learner import Learner, LearnerSettings, learning_device
+from learner.learner import Columns, Learner, LearnerSettings, learning_device
 from sim_core.checks import ConfigError
 
 RATE = 2e-3
+ROW_OF_COUNTS = transition_dtype(gym.spaces.Box(-127, 127, (3,), np.int8))
 
 
 def by_hand(learner, optimiser, online, target, rows, weights):
@@ -146,6 +147,26 @@ def test_td_errors_are_those_before_each_update(learner_settings, make_rows, gra
     learner.update(rows, RATE)
     assert learner.td_errors.dtype == np.float32
     np.testing.assert_allclose(learner.td_errors, np.concatenate(expected), rtol=1e-5, atol=1e-6)
+
+
+def test_columns_are_those_of_the_rows_whatever_was_there_before(make_rows):
+    columns_of = Columns()
+    for count, seed in ((5, 0), (5, 1), (7, 2), (5, 3)):
+        rows = make_rows(count, seed=seed).astype(ROW_OF_COUNTS)
+        columns = columns_of(rows)
+        assert columns.keys() == set(rows.dtype.names)
+        for name, column in columns.items():
+            assert column.dtype == (torch.int64 if name == "action" else torch.float32)
+            np.testing.assert_array_equal(column.numpy(), rows[name])
+
+
+def test_rows_are_left_as_they_are(learner_settings, make_rows):
+    """A call's tensors are memory of the learner, which a next call overwrites."""
+    learner, first, second = Learner(learner_settings), make_rows(32), make_rows(32, seed=1)
+    learner.update(first, RATE)
+    learner.update(second, RATE)
+    np.testing.assert_array_equal(first, make_rows(32))
+    np.testing.assert_array_equal(second, make_rows(32, seed=1))
 
 
 def test_weights_of_1_change_nothing(learner_settings, make_rows):
