@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 
 class WeightsSnapshot(NamedTuple):
-    """A published policy: weights and biases of each layer in turn, float32.
+    """A published policy: weights and biases of each layer of a plain network in turn, float32.
 
     `version` is the number of updates behind it, `time_s` the wall time of its publication.
     """
@@ -48,9 +48,58 @@ class QNetwork(nn.Module):
         return values
 
 
-def snapshot(network: QNetwork, version: int, time_s: float) -> WeightsSnapshot:
-    """Copies the network's parameters out."""
-    arrays = tuple(parameter.detach().cpu().numpy().copy() for parameter in network.parameters())
+class DuelingNetwork(nn.Module):
+    """A Q-network of two streams, Q(s, a) = V(s) + A(s, a) - mean over a' of A(s, a').
+
+    Z. Wang et al., "Dueling network architectures for deep reinforcement learning" (ICML 2016), Equation 9. All hidden
+    layers but the last are shared; the last one is two, a stream's each. They lie in one matrix, V's half first.
+
+    Args:
+      observation_size: number of elements of one observation.
+      hidden_sizes: width of every hidden layer; the last is that of each stream.
+      num_actions: number of actions.
+    """
+
+    def __init__(self, observation_size: int, hidden_sizes: tuple[int, ...], num_actions: int) -> None:
+        super().__init__()
+        *shared, self.width = hidden_sizes
+        sizes = (observation_size, *shared, 2 * self.width)
+        layers: list[nn.Module] = []
+        for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+            layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
+        self.layers = nn.Sequential(*layers)
+        self.value = nn.Linear(self.width, 1)
+        self.advantage = nn.Linear(self.width, num_actions)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Action values `[batch, actions]` float32."""
+        streams = self.layers(observation.flatten(1).float())
+        advantage = self.advantage(streams[:, self.width :])
+        values: Tensor = self.value(streams[:, : self.width]) + advantage - advantage.mean(dim=1, keepdim=True)
+        return values
+
+
+NETWORKS: dict[str, type[QNetwork] | type[DuelingNetwork]] = {"plain": QNetwork, "dueling": DuelingNetwork}
+
+
+def folded_head(value: tuple[Tensor, Tensor], advantage: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """The one linear layer that a dueling network's head is: weight `[actions, 2 width]`, bias `[actions]`.
+
+    Args:
+      value, advantage: (weight, bias) of either stream's last layer.
+    """
+    (value_weight, value_bias), (weight, bias) = value, advantage
+    centred = weight - weight.mean(dim=0)
+    return torch.cat([value_weight.expand_as(centred), centred], dim=1), value_bias + bias - bias.mean()
+
+
+def snapshot(network: QNetwork | DuelingNetwork, version: int, time_s: float) -> WeightsSnapshot:
+    """Copies the network's parameters out; a dueling network's as those of the plain network that it equals."""
+    parameters = [parameter.detach() for parameter in network.parameters()]
+    if isinstance(network, DuelingNetwork):
+        *parameters, value_weight, value_bias, weight, bias = parameters
+        parameters += folded_head((value_weight, value_bias), (weight, bias))
+    arrays = tuple(parameter.cpu().numpy().copy() for parameter in parameters)
     return WeightsSnapshot(version, time_s, arrays)
 
 

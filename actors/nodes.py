@@ -12,29 +12,40 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from actors.calls import Calls, Node, Ref
 from actors.network import WeightsSnapshot
+from actors.prioritised import PrioritisedShard, PrioritySettings
 from actors.replay import ReplayShard
 from actors.rollout import RolloutSettings, RolloutWorker
 from actors.transitions import AddReply, BlockReport, SampleReply, TransitionBlock
 
 
 class ShardSettings(NamedTuple):
-    """What a replay shard needs to know of the run."""
+    """What a replay shard needs to know of the run; without `priorities` it draws uniformly."""
 
     dtype: np.dtype[Any]
     capacity: int
     seed: int
+    priorities: PrioritySettings | None = None
+
+
+def make_shard(settings: ShardSettings) -> ReplayShard:
+    """The shard that the settings describe."""
+    dtype, capacity, seed, priorities = settings
+    if priorities is None:
+        return ReplayShard(dtype, capacity, seed)
+    return PrioritisedShard(dtype, capacity, seed, priorities)
 
 
 class ShardNode:
     """A replay shard that tells every worker of newer weights."""
 
     def __init__(self, settings: ShardSettings) -> None:
-        self.shard = ReplayShard(*settings)
+        self.shard = make_shard(settings)
         self._version = -1
         self._weights: Ref = None
 
@@ -51,6 +62,16 @@ class ShardNode:
     def sample(self, count: int) -> SampleReply:
         """Draws `count` rows."""
         return self.shard.sample(count)
+
+    def set_priorities(self, numbers: NDArray[np.int64], td_errors: NDArray[np.float32]) -> float:
+        """Takes the learner's answer to `sample`, see PrioritisedShard.set_priorities; returns the mass after it."""
+        assert isinstance(self.shard, PrioritisedShard)
+        self.shard.set_priorities(numbers, td_errors)
+        return self.shard.mass
+
+    def mass(self) -> float:
+        """What the shard counts among all (see ReplayShard.mass)."""
+        return self.shard.mass
 
     def size(self) -> int:
         """Transitions held."""

@@ -70,11 +70,26 @@ class BlockReport(NamedTuple):
     staleness_s: float
 
 
+class Draws(NamedTuple):
+    """How rows of a prioritised shard were drawn.
+
+    `number` `[count]` tells a row apart from the one that may take its place (it is the how manieth that the shard
+    stored), `probability` `[count]` is with which the shard drew it.
+    """
+
+    number: NDArray[np.int64]
+    probability: NDArray[np.float64]
+
+
 class SampleReply(NamedTuple):
-    """Rows drawn from a shard `[count]`, and the shard's size."""
+    """Rows drawn from a shard `[count]`, and what the shard counts among all (see ReplayShard.mass).
+
+    `draws` tells how they were drawn, None where all rows are drawn alike.
+    """
 
     rows: NDArray[Any]
-    size: int
+    mass: float
+    draws: Draws | None
 
 
 def transition_dtype(observation_space: gym.spaces.Box) -> np.dtype[Any]:

@@ -103,6 +103,8 @@ class Resume:
     """Name of the run, or its folder."""
     total_env_steps: int | None = None
     """Train on to this many env steps in all; the run's own number by default."""
+    device: Literal["auto", "cpu", "cuda"] | None = None
+    """Where the learner's networks live; as before by default."""
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
     address: str | None = None

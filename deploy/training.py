@@ -19,6 +19,7 @@ from deploy.tables import evaluation_table, summary_lines
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.journal import Row
+from learner.learner import learning_device
 from learner.run import RunResult, execute, resume_point
 from learner.run_folder import RunFolder, RunIdentity, find_run
 from learner.tracker import Tracker
@@ -45,6 +46,7 @@ def train(command: Train) -> int:
     folder = _new_folder(config, launch)
     make_folder(launch.runs_dir, "--runs-dir")
     env_shape(config.env)  # refuses an environment that cannot be made
+    _check_device(config, launch.ray_address())
     tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
     tracker.start(config)
     folder.save_config(config)
@@ -58,6 +60,8 @@ def resume(command: Resume) -> int:
     config, identity = folder.config(), folder.identity()
     checkpoint, skipped = resume_point(folder, config)
     config = _extended(config, command.total_env_steps, checkpoint.state["env_steps"])
+    config = dataclasses.replace(config, device=command.device or config.device)
+    _check_device(config, ray_address(command.address))
     tracker = Tracker(identity.tracking_uri, identity.experiment, None)
     tracker.resume(identity.mlflow_run_id)
     folder.save_config(config)
@@ -66,6 +70,12 @@ def resume(command: Resume) -> int:
         console.print(f"skipped: {reason}", highlight=False)
     console.print(f"going on from {checkpoint.folder}", highlight=False, soft_wrap=True)
     return _run(folder, config, tracker, checkpoint, ray_address(command.address))
+
+
+def _check_device(config: RunConfig, address: str | None) -> None:
+    """Refuses a device that is not there; what a cluster has is checked once it is joined."""
+    if config.engine == "process" or address is None:
+        learning_device(config.device)
 
 
 def _extended(config: RunConfig, total_env_steps: int | None, done: int) -> RunConfig:

@@ -9,6 +9,7 @@ import numpy as np
 
 from actors.calls import Calls, LocalCalls, Node
 from actors.nodes import RolloutNode, ShardNode, ShardSettings
+from actors.prioritised import PrioritySettings
 from actors.rollout import RolloutSettings
 from actors.transitions import transition_dtype
 from actors.vector_env import EnvShape, env_shape
@@ -46,6 +47,10 @@ def learner_settings(config: RunConfig, shape: EnvShape) -> LearnerSettings:
         max_gradient_norm=config.max_gradient_norm,
         gradients=config.gradients,
         seed=config.seed,
+        network=config.network,
+        loss=config.loss,
+        soft_target_rate=config.target_update_rate if config.target_update == "soft" else None,
+        device=config.device,
     )
 
 
@@ -66,7 +71,10 @@ def shard_settings(config: RunConfig, shape: EnvShape) -> list[ShardSettings]:
     seeds = np.random.SeedSequence((config.seed, 2)).generate_state(config.replay_shards)
     capacity = config.replay_capacity // config.replay_shards
     dtype = transition_dtype(shape.observation_space)
-    return [ShardSettings(dtype, capacity, int(seed)) for seed in seeds]
+    priorities = None
+    if config.replay == "prioritised":
+        priorities = PrioritySettings(config.priority_exponent, config.batch_size)
+    return [ShardSettings(dtype, capacity, int(seed), priorities) for seed in seeds]
 
 
 def process_cluster(config: RunConfig, incarnation: int) -> Cluster:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -31,6 +32,8 @@ class RunConfig:
     """Seed of every random stream of the run."""
     engine: Literal["ray", "process"] = "ray"
     """Ray actors, or everything in one process (deterministic, for tests and debugging)."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where the learner's networks live: `auto` is CUDA where there is one, else the CPU."""
     total_env_steps: int = 3_000_000
     """Env steps to train for, over all workers."""
 
@@ -63,11 +66,23 @@ class RunConfig:
     """Transitions that must be stored before the first update."""
     samples_per_insert: float = 2.0
     """How often a stored transition is sampled on average (Reverb's rate limiter)."""
+    replay: Literal["uniform", "prioritised"] = "uniform"
+    """All transitions drawn alike, or in proportion to |TD error| ** priority_exponent (Schaul et al. 2016)."""
+    priority_exponent: float = 0.6
+    """Prioritised: 0 draws uniformly, 1 in proportion to |TD error| (alpha)."""
+    importance_exponent_start: float = 0.4
+    """Prioritised: how much of the bias importance weights take away at the start (beta)."""
+    importance_exponent_end: float = 1.0
+    """Prioritised: the same after the change; 1 takes all of it away."""
+    importance_exponent_env_steps: int = 3_000_000
+    """Prioritised: env steps over which beta changes linearly."""
 
     algorithm: Literal["double_dqn", "dqn"] = "double_dqn"
     """Target of the update: Double DQN (Algorithm 2) or DQN (Algorithm 1)."""
     hidden_sizes: tuple[int, ...] = (128, 128)
     """Width of the Q-network's hidden layers."""
+    network: Literal["plain", "dueling"] = "plain"
+    """One stream, or two for state value and advantages that split before the last hidden layer (Wang et al. 2016)."""
     discount: float = 0.99
     """gamma per env step (the text's lambda = 0.001 cannot be a discount)."""
     n_step: int = 3
@@ -81,9 +96,17 @@ class RunConfig:
     learning_rate_end: float = 1e-4
     """Adam's learning rate after the decay."""
     learning_rate_decay_env_steps: int = 3_000_000
-    """Env steps over which the learning rate falls linearly."""
+    """Env steps over which the learning rate falls (constant: learning_rate_end = learning_rate)."""
+    learning_rate_schedule: Literal["linear", "cosine"] = "linear"
+    """Falls along a line, or along half a cosine."""
+    target_update: Literal["hard", "soft"] = "hard"
+    """Copies the online to the target network from time to time, or moves the target a little after every update."""
     target_update_interval: int = 500
-    """Updates between two copies of the online to the target network (C)."""
+    """Hard: updates between two copies (C)."""
+    target_update_rate: float = 0.005
+    """Soft: share of the online network in the target after an update (tau, Polyak's average)."""
+    loss: Literal["huber", "mse"] = "huber"
+    """Of TD errors: Huber's, quadratic up to 1 and linear beyond, or their mean square."""
     max_gradient_norm: float = 10.0
     """Gradients are scaled down to this norm."""
     gradients: Literal["by_hand", "autograd"] = "by_hand"
@@ -135,7 +158,20 @@ class RunConfig:
     def learning_rate_at(self, env_steps: int) -> float:
         """Adam's learning rate after `env_steps` env steps: a function of a counter that checkpoints hold."""
         done = min(1.0, env_steps / self.learning_rate_decay_env_steps)
+        if self.learning_rate_schedule == "cosine":
+            done = (1.0 - math.cos(math.pi * done)) / 2.0
         return self.learning_rate + done * (self.learning_rate_end - self.learning_rate)
+
+    def importance_exponent_at(self, env_steps: int) -> float:
+        """Exponent of the importance weights after `env_steps` env steps: a function of a counter as well."""
+        done = min(1.0, env_steps / self.importance_exponent_env_steps)
+        return self.importance_exponent_start + done * (self.importance_exponent_end - self.importance_exponent_start)
+
+    @property
+    def policy_sizes(self) -> tuple[int, ...]:
+        """Hidden sizes of the plain network that the learned policy acts with (see actors.network.snapshot)."""
+        *shared, last = self.hidden_sizes
+        return (*shared, 2 * last) if self.network == "dueling" else self.hidden_sizes
 
     @property
     def block_env_steps(self) -> int:
@@ -143,10 +179,17 @@ class RunConfig:
         return self.envs_per_worker * self.steps_per_block
 
 
+WHERE = ("engine", "device")
+"""Settings that say where a run goes on, and nothing of what it learns."""
+NEWER = (
+    "replay priority_exponent importance_exponent_start importance_exponent_end importance_exponent_env_steps network "
+    "learning_rate_schedule target_update target_update_rate loss"
+).split()
+"""Settings that the first checkpoints did not know: those still belong to a config that has them as by default."""
 AT_LEAST_ONE = (
     "total_env_steps workers envs_per_worker steps_per_block epsilon_decay_env_steps "
-    "learning_rate_decay_env_steps replay_shards replay_capacity min_replay n_step batch_size "
-    "updates_per_call target_update_interval eval_every_env_steps eval_episodes final_eval_episodes "
+    "learning_rate_decay_env_steps importance_exponent_env_steps replay_shards replay_capacity min_replay "
+    "n_step batch_size updates_per_call target_update_interval eval_every_env_steps eval_episodes final_eval_episodes "
     "log_every_env_steps checkpoint_every_env_steps keep_checkpoints"
 ).split()
 
@@ -160,11 +203,14 @@ def _check_ranges(config: RunConfig) -> None:
         0 <= config.final_eval_first_seed <= last,
         f"final_eval_first_seed must be in 0..{last}, not {config.final_eval_first_seed}",
     )
-    for name in ("epsilon_start", "epsilon_end", "ladder_base"):
+    shares = "epsilon_start epsilon_end ladder_base priority_exponent importance_exponent_start importance_exponent_end"
+    for name in shares.split():
         require(0 <= getattr(config, name) <= 1, f"{name} must be between 0 and 1, not {getattr(config, name)}")
     require(0 < config.discount <= 1, f"discount must be in (0, 1], not {config.discount}")
     for name in ("samples_per_insert", "learning_rate", "learning_rate_end", "max_gradient_norm"):
         require(getattr(config, name) > 0, f"{name} must be greater than 0, not {getattr(config, name)}")
+    rate = config.target_update_rate
+    require(0 < rate <= 1, f"target_update_rate must be in (0, 1], not {rate}")
     require(config.ladder_exponent >= 0, f"ladder_exponent must not be negative, not {config.ladder_exponent}")
     sizes = config.hidden_sizes
     require(
@@ -219,7 +265,10 @@ def from_dict(values: dict[str, Any]) -> RunConfig:
 def config_hash(config: RunConfig) -> str:
     """Twelve hex digits that tell configs apart; how long and where a run goes on does not count."""
     values = to_dict(config)
-    for name in ("total_env_steps", "engine"):
+    for name in ("total_env_steps", *WHERE):
         values.pop(name)
+    for name in NEWER:
+        if values[name] == RunConfig.__dataclass_fields__[name].default:
+            values.pop(name)
     text = json.dumps(values, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -1,25 +1,33 @@
-"""The update as pure functions: Double DQN and DQN targets, and their loss.
+"""The update as pure functions: Double DQN and DQN targets, losses and importance weights.
 
 Algorithm 1 (Mnih et al. 2015) and Algorithm 2 (van Hasselt, Guez, Silver 2016) of the dissertation.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+LossName = Literal["huber", "mse"]
+
 
 class Batch(NamedTuple):
-    """Transitions as tensors: s_tm1 and s_t `[batch, *shape]`, a_tm1 int64, r_t, discount_t `[batch]`."""
+    """Transitions as tensors: s_tm1 and s_t `[batch, *shape]`, a_tm1 int64, r_t, discount_t `[batch]`.
+
+    `weight` `[batch]` is what each loss counts (importance weights); None where all count alike.
+    """
 
     s_tm1: Tensor
     a_tm1: Tensor
     r_t: Tensor
     discount_t: Tensor
     s_t: Tensor
+    weight: Tensor | None = None
 
 
 def double_q_target(q_t_online: Tensor, q_t_target: Tensor, r_t: Tensor, discount_t: Tensor) -> Tensor:
@@ -38,15 +46,47 @@ def q_target(q_t_target: Tensor, r_t: Tensor, discount_t: Tensor) -> Tensor:
     return r_t + discount_t * q_t_target.amax(dim=1)
 
 
-def huber_loss(q_tm1: Tensor, a_tm1: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean Huber loss (delta = 1) of the taken actions' values against fixed targets.
+def mean_loss(
+    q_tm1: Tensor, a_tm1: Tensor, target: Tensor, loss: LossName = "huber", weight: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Mean loss of the taken actions' values against fixed targets.
+
+    Args:
+      q_tm1: action values `[batch, actions]`.
+      a_tm1: taken actions `[batch]`.
+      target: `[batch]`.
+      loss: of a TD error d, Huber's (d^2 / 2 up to |d| = 1, |d| - 1/2 beyond) or d^2.
+      weight: what each loss counts in the mean `[batch]`, None for 1.
 
     Returns:
       (loss, TD errors `[batch]`, target less value, detached).
     """
     chosen = q_tm1.gather(1, a_tm1.unsqueeze(1)).squeeze(1)
     fixed = target.detach()
-    return functional.smooth_l1_loss(chosen, fixed), (fixed - chosen).detach()
+    function = functional.smooth_l1_loss if loss == "huber" else functional.mse_loss
+    if weight is None:
+        mean = function(chosen, fixed)
+    else:
+        mean = (weight * function(chosen, fixed, reduction="none")).mean()
+    return mean, (fixed - chosen).detach()
+
+
+def importance_weights(probability: NDArray[np.float64], batch_size: int, exponent: float) -> NDArray[np.float32]:
+    """(1 / (N P(i))) ** beta over the greatest of its minibatch, so that weights scale updates down only.
+
+    Schaul et al. (2016), 3.4. N, the number of stored transitions, drops out.
+
+    Args:
+      probability: with which each transition was drawn, `[count]`, minibatch after minibatch.
+      batch_size: transitions of a minibatch; divides count.
+      exponent: beta.
+
+    Returns:
+      Weights `[count]` in (0, 1].
+    """
+    parts = probability.reshape(-1, batch_size)
+    weights: NDArray[np.float64] = (parts.min(axis=1, keepdims=True) / parts) ** exponent
+    return weights.ravel().astype(np.float32)
 
 
 def as_batch(rows: dict[str, Tensor], part: slice) -> Batch:
@@ -57,6 +97,7 @@ def as_batch(rows: dict[str, Tensor], part: slice) -> Batch:
         rows["reward"][part],
         rows["discount"][part],
         rows["next_observation"][part],
+        rows["weight"][part] if "weight" in rows else None,
     )
 
 

@@ -9,13 +9,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from actors.network import QNetwork, WeightsSnapshot, snapshot
-from learner.double_dqn import as_batch
-from learner.gradients import GRADIENTS, FlatNetwork
+from actors.network import NETWORKS, WeightsSnapshot, snapshot
+from learner.double_dqn import Batch, LossName, as_batch
+from learner.gradients import GRADIENTS, FlatNetwork, Measured
+from sim_core.checks import require
 
 
 class LearnerSettings(NamedTuple):
-    """What the learner needs to know of the run."""
+    """What the learner needs to know of the run.
+
+    With a `soft_target_rate` the target network follows the online network after every update (Polyak's average),
+    without one it is copied every `target_update_interval`.
+    """
 
     observation_size: int
     num_actions: int
@@ -26,6 +31,10 @@ class LearnerSettings(NamedTuple):
     max_gradient_norm: float
     gradients: Literal["by_hand", "autograd"]
     seed: int
+    network: Literal["plain", "dueling"]
+    loss: LossName
+    soft_target_rate: float | None
+    device: Literal["auto", "cpu", "cuda"]
 
 
 class UpdateStats(NamedTuple):
@@ -41,41 +50,70 @@ class Learner:
 
     Args:
       settings: see LearnerSettings.
+
+    Attributes:
+      td_errors: TD errors of the last call's rows, each before its update, `[rows]` float32.
+
+    Raises:
+      ConfigError: the device is not there.
     """
 
     def __init__(self, settings: LearnerSettings) -> None:
         self._settings = settings
         with torch.random.fork_rng():
             torch.manual_seed(settings.seed)
-            online = QNetwork(settings.observation_size, settings.hidden_sizes, settings.num_actions)
-        self._online = FlatNetwork(online)
+            online = NETWORKS[settings.network](settings.observation_size, settings.hidden_sizes, settings.num_actions)
+        self.device = learning_device(settings.device)
+        self._online = FlatNetwork(online.to(self.device))
         self._target = self._online.copy()
         self.online, self.target = self._online.network, self._target.network
-        self._gradients = GRADIENTS[settings.gradients](self._online, self._target, settings.double)
+        self._gradients = GRADIENTS[settings.gradients](self._online, self._target, settings.double, settings.loss)
         self.optimiser = torch.optim.Adam([self._online.values], fused=True)
         self.updates = 0
+        self._columns = Columns()
+        self.td_errors = np.zeros(0, np.float32)
 
-    def update(self, rows: NDArray[Any], learning_rate: float) -> UpdateStats:
-        """One update per `batch_size` rows of `rows`, a whole multiple of it."""
+    def update(
+        self, rows: NDArray[Any], learning_rate: float, weights: NDArray[np.float32] | None = None
+    ) -> UpdateStats:
+        """One update per `batch_size` rows of `rows`, a whole multiple of it.
+
+        Args:
+          rows: packed transitions.
+          learning_rate: Adam's.
+          weights: what each row's loss counts, `[rows]`, None for 1.
+        """
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate
-        columns = column_tensors(rows)
+        columns = {name: column.to(self.device) for name, column in self._columns(rows).items()}
+        if weights is not None:
+            columns["weight"] = torch.from_numpy(weights).to(self.device)
         size = self._settings.batch_size
-        sums = torch.zeros(3)
+        sums = torch.zeros(3, device=self.device)
+        errors = torch.empty(len(rows), device=self.device)
         starts = range(0, len(rows), size)
         for start in starts:
-            sums += self._step(columns, slice(start, start + size))
+            part = slice(start, start + size)
+            *means, errors[part] = self._step(as_batch(columns, part))
+            sums += torch.stack(means)
+        self.td_errors = errors.cpu().numpy()
         loss, q_mean, td_error = (sums / len(starts)).tolist()
         return UpdateStats(loss, q_mean, td_error)
 
-    def _step(self, columns: dict[str, Tensor], part: slice) -> Tensor:
-        measured = self._gradients(as_batch(columns, part))
+    def _step(self, batch: Batch) -> Measured:
+        measured = self._gradients(batch)
         self._online.clip_gradients(self._settings.max_gradient_norm)
         self.optimiser.step()
         self.updates += 1
-        if self.updates % self._settings.target_update_interval == 0:
-            self._target.values.data.copy_(self._online.values.data)
-        return torch.stack(measured)
+        self._update_target()
+        return measured
+
+    def _update_target(self) -> None:
+        online, target, rate = self._online.values.data, self._target.values.data, self._settings.soft_target_rate
+        if rate is not None:
+            target.lerp_(online, rate)
+        elif self.updates % self._settings.target_update_interval == 0:
+            target.copy_(online)
 
     def weights(self, time_s: float) -> WeightsSnapshot:
         """The online network, for publication."""
@@ -88,7 +126,7 @@ class Learner:
         for name, tensor in self.optimiser.state.get(self._online.values, {}).items():
             state[f"optimiser.{name}"] = tensor
         state["updates"] = torch.tensor(self.updates)
-        return {name: tensor.detach().clone().contiguous() for name, tensor in state.items()}
+        return {name: tensor.detach().cpu().clone().contiguous() for name, tensor in state.items()}
 
     def set_state(self, state: dict[str, Tensor]) -> None:
         """Takes up what `get_state` gave.
@@ -108,14 +146,40 @@ class Learner:
         self.updates = int(state["updates"])
 
 
+def learning_device(name: Literal["auto", "cpu", "cuda"]) -> torch.device:
+    """The device that a config's `device` means on this machine.
+
+    Raises:
+      ConfigError: it is CUDA, and there is none.
+    """
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    require(
+        name == "cpu" or torch.cuda.is_available(),
+        "device is cuda, but PyTorch finds no CUDA device where the learner runs; give --device auto or cpu",
+    )
+    return torch.device(name)
+
+
 def _part(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
 
 
-def column_tensors(rows: NDArray[Any]) -> dict[str, Tensor]:
-    """Columns of packed rows as tensors: observations and rewards float32, actions int64."""
-    columns = {name: torch.from_numpy(rows[name].astype(np.float32)) for name in ("reward", "discount")}
-    columns["action"] = torch.from_numpy(rows["action"].astype(np.int64))
-    for name in ("observation", "next_observation"):
-        columns[name] = torch.from_numpy(rows[name].astype(np.float32))
-    return columns
+class Columns:
+    """Columns of packed rows as tensors: observations, rewards and discounts float32, actions int64.
+
+    Calls with as many rows share their memory: the tensors of one are overwritten by the next. A super-batch is
+    megabytes, and to give memory back and take it anew with every call costs more than what is written to it.
+    """
+
+    def __init__(self) -> None:
+        self._tensors: dict[str, Tensor] = {}
+
+    def __call__(self, rows: NDArray[Any]) -> dict[str, Tensor]:
+        """The columns of `rows`, `[count, ...]` each."""
+        if not self._tensors or len(self._tensors["action"]) != len(rows):
+            dtypes = {name: torch.int64 if name == "action" else torch.float32 for name in rows.dtype.names or ()}
+            self._tensors = {name: torch.empty(rows[name].shape, dtype=dtype) for name, dtype in dtypes.items()}
+        for name, tensor in self._tensors.items():
+            np.copyto(tensor.numpy(), rows[name], casting="unsafe")
+        return dict(self._tensors)

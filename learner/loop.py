@@ -144,8 +144,12 @@ class TrainingLoop:
             if not updates:
                 return
             self._pacer.sampling(updates)
-            rate = self._config.learning_rate_at(self.env_steps)
-            self._add(self._calls.start(self._cluster.learner, "update", updates, rate), Pending("update", 0, updates))
+            rate, exponent = (
+                self._config.learning_rate_at(self.env_steps),
+                self._config.importance_exponent_at(self.env_steps),
+            )
+            ref = self._calls.start(self._cluster.learner, "update", updates, rate, exponent)
+            self._add(ref, Pending("update", 0, updates))
             under_way += 1
 
     def _start_evaluation(self) -> None:

@@ -14,7 +14,8 @@ from safetensors.torch import load_file, save_file
 
 from actors.calls import Calls, Node, Ref
 from actors.nodes import ShardNode
-from actors.transitions import AddReply, SampleReply, TransitionBlock
+from actors.transitions import AddReply, Draws, SampleReply, TransitionBlock
+from learner.double_dqn import importance_weights
 from learner.learner import Learner, LearnerSettings, UpdateStats
 
 
@@ -26,12 +27,24 @@ class UpdateReport(NamedTuple):
     weights: list[Ref]
 
 
+class Sample(NamedTuple):
+    """A super-batch: rows `[count]`, and of prioritised ones also how they were drawn.
+
+    `shard` `[count]` is the shard that each came from, None where there is one; `draws.probability` is among the rows
+    of all shards.
+    """
+
+    rows: NDArray[Any]
+    shard: NDArray[np.int64] | None
+    draws: Draws | None
+
+
 class LearnerNode:
     """The learner with its replay shards, in this process or elsewhere.
 
     Args:
       settings: see LearnerSettings.
-      shards: nodes with `sample`, `publish`, `size`, `save`, `load`.
+      shards: nodes with `sample`, `set_priorities`, `publish`, `mass`, `save`, `load`.
       shard_calls: how to call the shards.
       calls: how to share weights with rollout workers.
     """
@@ -44,7 +57,8 @@ class LearnerNode:
         self._shard_calls = shard_calls
         self._calls = calls
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence((settings.seed, 1))))
-        self._sizes = np.zeros(len(shards), np.float64)
+        self._masses = np.zeros(len(shards), np.float64)
+        self._answers: dict[int, Ref] = {}
         self._weights: Ref = None
         self.publish()
 
@@ -53,10 +67,18 @@ class LearnerNode:
         shard: ShardNode = self._shards[block.header.sequence % len(self._shards)]
         return shard.add(block)
 
-    def update(self, updates: int, learning_rate: float) -> UpdateReport:
-        """Samples a super-batch, makes `updates` updates of it, and publishes the weights."""
-        rows = self._sample(updates * self._settings.batch_size)
-        stats = self._learner.update(rows, learning_rate)
+    def update(self, updates: int, learning_rate: float, importance_exponent: float = 1.0) -> UpdateReport:
+        """Samples a super-batch, makes `updates` updates of it, and publishes the weights.
+
+        Of prioritised shards the sample is weighted, and the TD errors go back to the shards that it came from.
+        """
+        sample = self._sample(updates * self._settings.batch_size)
+        if sample.draws is None:
+            stats = self._learner.update(sample.rows, learning_rate)
+        else:
+            weights = importance_weights(sample.draws.probability, self._settings.batch_size, importance_exponent)
+            stats = self._learner.update(sample.rows, learning_rate, weights)
+            self._answer(sample)
         return UpdateReport(stats, self._learner.updates, self.publish())
 
     def publish(self) -> list[Ref]:
@@ -70,19 +92,42 @@ class LearnerNode:
             self._shard_calls.start(shard, "publish", self._learner.updates, [self._weights])
         return [self._weights]
 
-    def _sample(self, count: int) -> NDArray[Any]:
-        """Draws rows from the shards in proportion to their sizes, in random order."""
+    def _sample(self, count: int) -> Sample:
+        """Draws rows from the shards in proportion to their masses, in random order."""
+        self._take_answers()
         if len(self._shards) == 1:
             reply: SampleReply = self._shard_calls.get(self._shard_calls.start(self._shards[0], "sample", count))
-            return reply.rows
-        if not self._sizes.all():
-            self._sizes[:] = self._ask_all("size")
-        shares = self._rng.multinomial(count, self._sizes / self._sizes.sum())
+            return Sample(reply.rows, None, reply.draws)
+        if not self._masses.all():
+            self._masses[:] = self._ask_all("mass")
+        chances = self._masses / self._masses.sum()
+        shares = self._rng.multinomial(count, chances)
         asked = np.flatnonzero(shares)  # a shard may still be empty
         refs = [self._shard_calls.start(self._shards[i], "sample", int(shares[i])) for i in asked]
         replies = [self._shard_calls.get(ref) for ref in refs]
-        self._sizes[asked] = [reply.size for reply in replies]
-        return self._rng.permutation(np.concatenate([reply.rows for reply in replies]))
+        self._masses[asked] = [reply.mass for reply in replies]
+        order = self._rng.permutation(count)
+        rows = np.concatenate([reply.rows for reply in replies])[order]
+        drawn = [(chances[i], reply.draws) for i, reply in zip(asked, replies, strict=True) if reply.draws is not None]
+        if not drawn:
+            return Sample(rows, None, None)
+        number = np.concatenate([draws.number for _, draws in drawn])[order]
+        probability = np.concatenate([chance * draws.probability for chance, draws in drawn])[order]
+        return Sample(rows, np.repeat(asked, shares[asked])[order], Draws(number, probability))
+
+    def _answer(self, sample: Sample) -> None:
+        """Sends the TD errors of the updates to the shards that their rows came from."""
+        assert sample.draws is not None
+        for i in np.unique(sample.shard) if sample.shard is not None else [0]:
+            mine = slice(None) if sample.shard is None else sample.shard == i
+            answer = (sample.draws.number[mine], self._learner.td_errors[mine])
+            self._answers[int(i)] = self._shard_calls.start(self._shards[i], "set_priorities", *answer)
+
+    def _take_answers(self) -> None:
+        """Waits until the shards have taken the last call's TD errors, which may have failed there."""
+        while self._answers:
+            i, ref = self._answers.popitem()
+            self._masses[i] = self._shard_calls.get(ref)
 
     def _ask_all(self, method: str) -> list[Any]:
         refs = [self._shard_calls.start(shard, method) for shard in self._shards]
@@ -90,12 +135,13 @@ class LearnerNode:
 
     def save(self, folder: Path) -> dict[str, Any]:
         """Writes learner and shards into `folder`; returns the rest of their state, for JSON."""
+        self._take_answers()
         save_file(self._learner.get_state(), str(folder / "learner.safetensors"))
         refs = [
             self._shard_calls.start(shard, "save", folder / f"shard-{i}.zarr") for i, shard in enumerate(self._shards)
         ]
         shards = [self._shard_calls.get(ref) for ref in refs]
-        return {"shards": shards, "rng": self._rng.bit_generator.state, "sizes": self._sizes.tolist()}
+        return {"shards": shards, "rng": self._rng.bit_generator.state, "sizes": self._masses.tolist()}
 
     def load(self, folder: Path, state: dict[str, Any]) -> list[Ref]:
         """Takes up what `save` wrote and returned; publishes the weights (see `publish`).
@@ -116,7 +162,8 @@ class LearnerNode:
         for ref in refs:
             self._shard_calls.get(ref)
         self._rng.bit_generator.state = state["rng"]
-        self._sizes[:] = state["sizes"]
+        self._answers.clear()
+        self._masses[:] = state["sizes"]
         return self.publish()
 
     def weights(self) -> list[Ref]:

@@ -8,7 +8,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from actors.network import QNetwork, WeightsSnapshot, load_snapshot, snapshot
+from actors.network import NETWORKS, DuelingNetwork, QNetwork, WeightsSnapshot, load_snapshot, snapshot
 from actors.vector_env import EnvShape
 from learner.checkpoint import Checkpoint, CheckpointError
 from learner.config import RunConfig
@@ -22,12 +22,13 @@ def read_policy(checkpoint: Checkpoint, config: RunConfig, shape: EnvShape) -> W
     Raises:
       CheckpointError: the weights do not fit a network of `config` on environments of `shape`.
     """
-    return _read(checkpoint.folder / "learner.safetensors", checkpoint.state["updates"], config, shape)
+    network = NETWORKS[config.network](shape.observation_size, config.hidden_sizes, shape.num_actions)
+    return _read(checkpoint.folder / "learner.safetensors", checkpoint.state["updates"], network)
 
 
 def save_policy(path: Path, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> None:
-    """Writes a policy to a file of its own; an older one is replaced once the new is whole."""
-    network = QNetwork(shape.observation_size, config.hidden_sizes, shape.num_actions)
+    """Writes a policy to a file of its own, as a plain network; an older one is replaced once the new is whole."""
+    network = QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions)
     load_snapshot(network, weights)
     tensors = {f"{ONLINE}{name}": tensor for name, tensor in network.state_dict().items()}
     part = path.with_name(path.name + ".part")
@@ -46,18 +47,17 @@ def read_saved_policy(path: Path, config: RunConfig, shape: EnvShape) -> Weights
             updates = int((file.metadata() or {})["updates"])
     except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise CheckpointError(f"the policy {path} cannot be read ({error}); train anew") from error
-    return _read(path, updates, config, shape)
+    return _read(path, updates, QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions))
 
 
-def _read(path: Path, updates: int, config: RunConfig, shape: EnvShape) -> WeightsSnapshot:
-    network = QNetwork(shape.observation_size, config.hidden_sizes, shape.num_actions)
+def _read(path: Path, updates: int, network: QNetwork | DuelingNetwork) -> WeightsSnapshot:
     try:
         network.load_state_dict(_online(load_file(str(path))))
     except (RuntimeError, OSError, SafetensorError) as error:
         raise CheckpointError(
             f"the policy of {path.parent} takes other observations or actions than this setup: name a run whose "
-            "hidden_sizes, sectors, stop_action, sensor_counts and goal_in_state (for M_IN and M_OUT also method and "
-            "groups) are those of its config"
+            "hidden_sizes, network, sectors, stop_action, sensor_counts and goal_in_state (for M_IN and M_OUT also "
+            "method and groups) are those of its config"
         ) from error
     return snapshot(network, updates, 0.0)
 

@@ -22,7 +22,7 @@ from actors.vector_env import EnvSpec, env_shape
 from learner.cluster import Cluster, learner_settings, rollout_settings, shard_settings
 from learner.config import RunConfig
 from learner.node import LearnerNode
-from sim_core.checks import ConfigError
+from sim_core.checks import ConfigError, require
 
 PUSHES_IN_FLIGHT = 1
 """Pushes of a worker that may be under way while it collects the next block."""
@@ -99,6 +99,20 @@ def cluster_cpus() -> int:
     return int(ray.cluster_resources().get("CPU", 0))
 
 
+def learner_gpus(config: RunConfig) -> int:
+    """GPUs to keep for the learner in the cluster that this process has joined.
+
+    Raises:
+      ConfigError: the config wants CUDA, and the cluster has no GPU.
+    """
+    if config.device == "cpu":
+        return 0
+    resources = ray.cluster_resources() if config.device == "cuda" else ray.available_resources()
+    have = resources.get("GPU", 0) >= 1
+    require(have or config.device == "auto", "device is cuda, but the cluster has no GPU; give --device auto or cpu")
+    return int(have)
+
+
 def connect(cpus: int, address: str | None) -> None:
     """Joins the cluster at `address`, or starts Ray on this machine with room for `cpus` CPU slots.
 
@@ -145,7 +159,7 @@ def ray_cluster(config: RunConfig, incarnation: int, address: str | None) -> Clu
     shards: list[Node] = []
     if config.replay_placement == "actors":
         shards = [ray.remote(num_cpus=1)(ShardNode).remote(settings) for settings in shard_settings(config, shape)]
-    learner = ray.remote(num_cpus=1)(LearnerActor).remote(config, shards)
+    learner = ray.remote(num_cpus=1, num_gpus=learner_gpus(config))(LearnerActor).remote(config, shards)
     targets: list[ActorHandle] = shards or [learner]
     workers: list[Node] = [
         ray.remote(num_cpus=1)(RolloutNode).remote(

@@ -95,7 +95,7 @@ def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list
     if checkpoint.state["config_hash"] != config_hash(config):
         raise CheckpointError(
             f"checkpoint {checkpoint.folder} was made with another config than {folder.path / 'config.json'}: "
-            "only total_env_steps and engine may change between two sittings"
+            "only total_env_steps, engine and device may change between two sittings"
         )
     return checkpoint, skipped
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
 from actors.result_table import GROUPS, LEARNED, ROBOTS, ResultRow
-from learner.config import RunConfig, to_dict
+from learner.config import WHERE, RunConfig, to_dict
 from learner.presets import PresetName, preset_config
 from sim_core.checks import check_fields, require
 from sim_core.config import MethodName, WorldConfig
@@ -82,7 +82,7 @@ class SweepConfig:
 
 
 NOT_SET = (
-    "world seed engine method robots groups env_id total_env_steps final_eval_episodes final_eval_first_seed"
+    "world seed engine device method robots groups env_id total_env_steps final_eval_episodes final_eval_first_seed"
 ).split()
 """Settings that the grid itself decides."""
 
@@ -144,7 +144,8 @@ def cell_hash(config: RunConfig) -> str:
     world = {name: value for name, value in to_dict(config)["world"].items() if value != defaults["world"][name]}
     run = {name: value for name, value in to_dict(config).items() if value != defaults[name]}
     values = {**run, "world": world}
-    values.pop("engine", None)
+    for name in WHERE:
+        values.pop(name, None)
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -165,10 +166,13 @@ def make_cell(sweep: SweepConfig, method: MethodName, robots: int, groups: int, 
         epsilon_decay_env_steps=max(1, preset.epsilon_decay_env_steps * env_steps // preset.total_env_steps),
         seed=seed,
         engine="process",
+        device="cpu",  # cells share a machine, one a CPU
         final_eval_episodes=sweep.episodes,
         final_eval_first_seed=sweep.first_seed,
     )
-    config = dataclasses.replace(config, **run)
+    prioritised = run.get("replay") == "prioritised"  # else the default stays, with which cells have their names
+    scheduled = {"importance_exponent_env_steps": env_steps} if prioritised else {}
+    config = dataclasses.replace(config, **{**scheduled, **run})
     return Cell(f"{method}-{robots}r{groups}g-s{seed}-{cell_hash(config)}", config)
 
 

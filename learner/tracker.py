@@ -156,7 +156,7 @@ class Tracker:
 
     def log_policy(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> None:
         """Logs the greedy policy's Q-network as a model with its signature: observations to action values."""
-        network = QNetwork(shape.observation_size, config.hidden_sizes, shape.num_actions)
+        network = QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions)
         load_snapshot(network, weights)
         example = np.zeros((2, *shape.observation_space.shape), np.float32)
         with torch.no_grad():

@@ -6,13 +6,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.network import Policy, QNetwork, WeightsSnapshot, load_snapshot, snapshot
+from actors.network import NETWORKS, DuelingNetwork, Policy, QNetwork, WeightsSnapshot, load_snapshot, snapshot
 
 
-def make_network(size, hidden_sizes, num_actions, seed=0):
+def make_network(size, hidden_sizes, num_actions, seed=0, kind="plain"):
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        return QNetwork(size, hidden_sizes, num_actions)
+        return NETWORKS[kind](size, hidden_sizes, num_actions)
 
 
 def observations(shape, dtype, seed=0, batch=7):
@@ -26,10 +26,11 @@ def observations(shape, dtype, seed=0, batch=7):
     hidden_sizes=st.lists(st.integers(1, 20), min_size=1, max_size=3).map(tuple),
     num_actions=st.integers(1, 9),
     seed=st.integers(0, 1000),
+    kind=st.sampled_from(["plain", "dueling"]),
 )
-@settings(max_examples=40, deadline=None)
-def test_policy_computes_what_the_network_computes(shape, dtype, hidden_sizes, num_actions, seed):
-    network = make_network(int(np.prod(shape)), hidden_sizes, num_actions, seed)
+@settings(max_examples=80, deadline=None)
+def test_policy_computes_what_the_network_computes(shape, dtype, hidden_sizes, num_actions, seed, kind):
+    network = make_network(int(np.prod(shape)), hidden_sizes, num_actions, seed, kind)
     observation = observations(shape, dtype, seed)
     policy = Policy(snapshot(network, 0, 0.0))
     with torch.no_grad():
@@ -52,6 +53,41 @@ def test_ties_go_to_the_lowest_index():
     zeros = (np.zeros((3, 2), np.float32), np.zeros(3, np.float32))
     output = (np.zeros((4, 3), np.float32), np.array([1, 2, 2, 0], np.float32))
     np.testing.assert_array_equal(Policy(WeightsSnapshot(0, 0.0, zeros + output)).greedy(np.zeros((3, 2))), [1, 1, 1])
+
+
+def streams(network, observation):
+    """V(s) and A(s, a) of a dueling network, loop by loop from its parameters."""
+    parameters = {name: tensor.detach().numpy().astype(float) for name, tensor in network.named_parameters()}
+    x = observation.astype(float)
+    for i in range(0, len(network.layers), 2):
+        x = np.maximum(x @ parameters[f"layers.{i}.weight"].T + parameters[f"layers.{i}.bias"], 0)
+    half = x.shape[1] // 2
+    value, advantage = (
+        hidden @ parameters[f"{name}.weight"].T + parameters[f"{name}.bias"]
+        for name, hidden in (("value", x[:, :half]), ("advantage", x[:, half:]))
+    )
+    return value, advantage
+
+
+@pytest.mark.parametrize("hidden_sizes", [(5,), (7, 6), (8, 7, 5)])
+def test_a_dueling_network_is_equation_9(hidden_sizes):
+    """Q = V + A - mean A: the mean over actions is the state's value, however the advantages are shifted."""
+    network, observation = make_network(4, hidden_sizes, 3, kind="dueling"), observations((4,), np.float32)
+    value, advantage = streams(network, observation)
+    assert value.shape == (7, 1) and advantage.shape == (7, 3)
+    with torch.no_grad():
+        values = network(torch.from_numpy(observation))
+        np.testing.assert_allclose(values, value + advantage - advantage.mean(axis=1, keepdims=True), rtol=1e-4)
+        np.testing.assert_allclose(values.mean(dim=1), value[:, 0], rtol=1e-4, atol=1e-5)
+        network.advantage.bias.add_(3.0)
+        torch.testing.assert_close(network(torch.from_numpy(observation)), values, rtol=1e-4, atol=1e-5)
+
+
+def test_a_dueling_network_has_a_stream_each_of_the_last_hidden_width():
+    shapes = [tuple(parameter.shape) for parameter in DuelingNetwork(4, (8, 5), 3).parameters()]
+    assert shapes == [(8, 4), (8,), (10, 8), (10,), (1, 5), (1,), (3, 5), (3,)]
+    arrays = snapshot(DuelingNetwork(4, (8, 5), 3), 0, 0.0).arrays
+    assert [array.shape for array in arrays] == [tuple(p.shape) for p in QNetwork(4, (8, 10), 3).parameters()]
 
 
 def test_snapshot_round_trip_and_copies():

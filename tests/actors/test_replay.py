@@ -118,7 +118,7 @@ def test_samples_are_copies():
     shard = ReplayShard(DTYPE, 4, 1)
     shard.add(make_block([7, 7, 7, 7]))
     reply = shard.sample(8)
-    assert reply.size == 4
+    assert reply.mass == 4 and reply.draws is None
     reply.rows["action"] = 0
     reply.rows["reward"] = 0
     assert held(shard) == {7}

@@ -10,8 +10,8 @@ from rich.table import Table
 
 from actors.network import QNetwork
 from actors.transitions import transition_dtype
-from learner.double_dqn import as_batch, huber_loss, targets
-from learner.learner import Learner, LearnerSettings, column_tensors
+from learner.double_dqn import as_batch, mean_loss, targets
+from learner.learner import Columns, Learner, LearnerSettings
 from tests.benchmarks.timing import rates, ratio, spread
 
 SHAPES = (((16, 64, 64, 8), 64), ((16, 64, 64, 8), 256), ((16, 128, 128, 8), 256), ((72, 128, 128, 9), 256))
@@ -31,7 +31,21 @@ def random_rows(size: int, observation_size: int, num_actions: int) -> np.ndarra
 
 
 def our_work(rows: np.ndarray, sizes: tuple[int, ...], batch: int):
-    settings = LearnerSettings(sizes[0], sizes[-1], sizes[1:-1], True, batch, 500, 10.0, "by_hand", 0)
+    settings = LearnerSettings(
+        observation_size=sizes[0],
+        num_actions=sizes[-1],
+        hidden_sizes=sizes[1:-1],
+        double=True,
+        batch_size=batch,
+        target_update_interval=500,
+        max_gradient_norm=10.0,
+        gradients="by_hand",
+        seed=0,
+        network="plain",
+        loss="huber",
+        soft_target_rate=None,
+        device="cpu",
+    )
     learner = Learner(settings)
 
     def work() -> int:
@@ -45,13 +59,14 @@ def plain_work(rows: np.ndarray, sizes: tuple[int, ...], batch: int):
     """What a reader of a textbook would write: autograd, fused Adam, gradients clipped."""
     online = QNetwork(sizes[0], sizes[1:-1], sizes[-1])
     target = copy.deepcopy(online)
+    columns_of = Columns()
     optimiser = torch.optim.Adam(online.parameters(), lr=RATE, fused=True)
 
     def work() -> int:
-        columns = column_tensors(rows)
+        columns = columns_of(rows)
         for start in range(0, len(rows), batch):
             part = as_batch(columns, slice(start, start + batch))
-            loss, _ = huber_loss(online(part.s_tm1), part.a_tm1, targets(part, online, target, True))
+            loss, _ = mean_loss(online(part.s_tm1), part.a_tm1, targets(part, online, target, True))
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             torch.nn.utils.clip_grad_norm_(online.parameters(), 10.0)

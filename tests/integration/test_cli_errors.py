@@ -7,6 +7,7 @@ import socket
 from pathlib import Path
 
 import pytest
+import torch
 
 from deploy.cli import main, parse
 from learner.presets import preset_config
@@ -41,6 +42,10 @@ def free_port() -> int:
         (["--start-spacing-m", "0.2"], ["overlap", "start_spacing_m"]),
         (["--engine", "slurm"], ["--engine", "process"]),
         (["--batch-size", "0"], ["batch_size", "at least 1"]),
+        (["--replay", "prioritized"], ["--replay", "prioritised"]),
+        (["--replay", "prioritised", "--priority-exponent", "2"], ["priority_exponent", "between 0 and 1"]),
+        (["--target-update", "soft", "--target-update-rate", "0"], ["target_update_rate", "(0, 1]"]),
+        (["--loss", "l1"], ["--loss", "huber", "mse"]),
         (["--discount", "1.5"], ["discount", "(0, 1]"]),
         (["--min-replay", "9999999"], ["min_replay", "replay_capacity"]),
         (["--env-id", "NoSuchEnv-v0"], ["env_id", "NoSuchEnv"]),
@@ -61,6 +66,15 @@ def test_train_refuses(capsys, tmp_path, monkeypatch, arguments, words):
     for word in words:
         assert word in error
     assert not list(tmp_path.iterdir()) or not list(tmp_path.glob("runs/*/config.json")), "nothing was started"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+@pytest.mark.parametrize("engine", ["process", "ray"])
+def test_cuda_is_refused_where_there_is_none(capsys, tmp_path, monkeypatch, engine):
+    monkeypatch.chdir(tmp_path)
+    code, error = run(capsys, "train", "--device", "cuda", "--engine", engine)
+    assert code == 2 and "no CUDA device" in error and "--device auto" in error and "Traceback" not in error
+    assert not list(tmp_path.glob("runs/*/config.json"))
 
 
 @pytest.mark.parametrize(
@@ -142,6 +156,16 @@ class TestWithARun:
         code, error = run(capsys, "resume", "r", "--runs-dir", str(runs))
         assert code == 2
         assert "--total-env-steps" in error
+
+    @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+    def test_a_run_of_another_device_is_resumed_elsewhere(self, capsys, runs):
+        path = runs / "r" / "config.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"device": "cuda"}))
+        further = ("resume", "r", "--runs-dir", str(runs), "--total-env-steps", "6500")
+        code, error = run(capsys, *further)
+        assert code == 2 and "no CUDA device" in error
+        assert run(capsys, *further, "--device", "cpu")[0] == 0
+        assert json.loads(path.read_text())["device"] == "cpu"
 
     def test_missing_checkpoints_are_refused(self, capsys, runs):
         shutil.rmtree(runs / "r" / "checkpoints")

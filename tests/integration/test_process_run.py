@@ -20,6 +20,16 @@ CLOCKED = ("speed/", "system/", "policy/staleness_s")
 """Metrics that depend on the clock."""
 
 
+OPTIONS = {
+    "replay": "prioritised",
+    "importance_exponent_env_steps": 5_000,
+    "network": "dueling",
+    "loss": "mse",
+    "target_update": "soft",
+    "learning_rate_schedule": "cosine",
+}
+
+
 class Silent:
     def row(self, row):
         pass
@@ -37,9 +47,13 @@ class Listing(Silent):
 
 
 def train(config, folder: Path, observer=None) -> None:
-    cluster = process_cluster(config, 0)
-    with closing(Journal(folder / "metrics.jsonl", 0)) as journal:
+    """Trains to the end, from the newest checkpoint in the folder if there is one."""
+    saved = newest_valid(folder / "checkpoints")[0] if (folder / "checkpoints").exists() else None
+    cluster = process_cluster(config, saved.state["incarnation"] + 1 if saved else 0)
+    with closing(Journal(folder / "metrics.jsonl", saved.state["journal_offset"] if saved else 0)) as journal:
         loop = TrainingLoop(config, cluster, journal, folder / "checkpoints", observer or Silent(), bool)
+        if saved:
+            loop.restore(saved)
         assert loop.run()
 
 
@@ -92,11 +106,31 @@ def test_no_checkpoint_is_written_twice(small, tmp_path):
     assert len(listing.steps) == len(set(listing.steps)) >= 2 and listing.steps[-1] >= small.total_env_steps
 
 
+@pytest.mark.parametrize("name", OPTIONS)
+def test_every_option_changes_what_is_learned(small, tmp_path, name):
+    replay = {"replay": "prioritised"} if name.startswith("importance") else {}
+    train(dataclasses.replace(small, **replay), tmp_path / "one")
+    train(dataclasses.replace(small, **replay, **{name: OPTIONS[name]}), tmp_path / "two")
+    one, two = (final_state(tmp_path / folder)[0]["learner/online.layers.0.weight"] for folder in ("one", "two"))
+    assert one.shape != two.shape or not np.array_equal(one, two)
+
+
 def test_another_seed_is_another_run(small, tmp_path):
     train(small, tmp_path / "one")
     train(dataclasses.replace(small, seed=1), tmp_path / "two")
     one, two = final_state(tmp_path / "one")[0], final_state(tmp_path / "two")[0]
     assert not np.array_equal(one["learner/online.layers.0.weight"], two["learner/online.layers.0.weight"])
+
+
+@pytest.mark.parametrize("shards", [1, 3])
+def test_a_resumed_run_with_every_option_is_the_uninterrupted_one(small, tmp_path, shards):
+    whole = dataclasses.replace(small, replay_shards=shards, workers=2, replay_capacity=4_200, **OPTIONS)
+    train(whole, tmp_path / "whole")
+    train(dataclasses.replace(whole, total_env_steps=3_072), tmp_path / "halves")
+    train(whole, tmp_path / "halves")
+    halves = final_state(tmp_path / "halves")
+    assert "shard-0-priorities/priority" in halves[0]
+    assert_same(final_state(tmp_path / "whole"), halves)
 
 
 @pytest.mark.parametrize("shards", [1, 3])

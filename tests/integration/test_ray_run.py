@@ -7,7 +7,9 @@ from collections import Counter
 from pathlib import Path
 
 import mlflow
+import numpy as np
 import pytest
+import zarr
 from safetensors.numpy import load_file
 
 from learner.checkpoint import newest_valid
@@ -67,8 +69,10 @@ def test_a_run_over_ray_leaves_everything_a_user_compares(shoal, tmp_path):
     assert json.loads((tmp_path / "runs/r/config.json").read_text()) == json.loads(json.dumps(to_dict(config)))
 
 
-def test_every_transition_is_accounted_for(shoal, tmp_path):
+@pytest.mark.parametrize("replay", ["uniform", "prioritised"])
+def test_every_transition_is_accounted_for(shoal, tmp_path, replay):
     config = dataclasses.replace(SMALL, engine="ray", workers=2, replay_shards=2, replay_placement="actors")
+    config = dataclasses.replace(config, replay=replay, network="dueling" if replay == "prioritised" else "plain")
     done = shoal("train", "--name", "r", *flags(config))
     assert done.returncode == 0, done.stderr
     checkpoint, _ = newest_valid(tmp_path / "runs/r/checkpoints")
@@ -82,6 +86,17 @@ def test_every_transition_is_accounted_for(shoal, tmp_path):
     ahead = state["pacing"]["inserted"] * config.samples_per_insert - state["pacing"]["sampled"]
     band = 2 * config.batch_size * config.updates_per_call + 6 * config.block_env_steps * config.samples_per_insert
     assert 0 <= ahead - config.min_replay * config.samples_per_insert <= band
+    if replay == "prioritised":
+        assert_priorities_came_back(checkpoint.folder, shards)
+
+
+def assert_priorities_came_back(folder: Path, shards: list) -> None:
+    """The learner's answers reached the Ray actors that the rows are in."""
+    for i, shard in enumerate(shards):
+        rows = zarr.open_group(str(folder / f"shard-{i}-priorities.zarr"), mode="r")
+        priorities = np.asarray(rows["priority"][...])
+        assert len(priorities) == shard["size"] and 0 < priorities.max() <= shard["largest_priority"]
+        assert len(np.unique(priorities)) > 100
 
 
 def test_kill_9_of_the_whole_job_costs_only_what_came_after_the_last_checkpoint(shoal, tmp_path):

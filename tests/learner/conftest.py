@@ -49,6 +49,10 @@ def learner_settings():
         max_gradient_norm=0.25,
         gradients="by_hand",
         seed=5,
+        network="plain",
+        loss="huber",
+        soft_target_rate=None,
+        device="cpu",
     )
 
 

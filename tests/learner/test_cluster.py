@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 
+from actors.prioritised import PrioritySettings
 from actors.vector_env import env_shape
 from learner.cluster import learner_settings, process_cluster, rollout_settings, shard_settings
 
@@ -17,6 +18,18 @@ def test_settings_are_those_of_the_config(small_run):
         for name in {"batch_size", "target_update_interval", "steps_per_block", "n_step", "discount", "seed"}:
             assert getattr(settings, name, None) in (None, getattr(small_run, name)), name
     assert rollout_settings(small_run).num_envs == 4
+
+
+def test_options_reach_the_learner_and_the_shards(small_run):
+    shape = env_shape(small_run.env)
+    plain = learner_settings(small_run, shape)
+    assert (plain.network, plain.loss, plain.soft_target_rate, plain.device) == ("plain", "huber", None, "auto")
+    assert [shard.priorities for shard in shard_settings(small_run, shape)] == [None]
+    options = {"network": "dueling", "loss": "mse", "target_update": "soft", "target_update_rate": 0.2, "device": "cpu"}
+    config = dataclasses.replace(small_run, replay="prioritised", priority_exponent=0.7, **options)
+    changed = learner_settings(config, shape)
+    assert (changed.network, changed.loss, changed.soft_target_rate, changed.device) == ("dueling", "mse", 0.2, "cpu")
+    assert [shard.priorities for shard in shard_settings(config, shape)] == [PrioritySettings(0.7, 16)]
 
 
 def test_shards_share_the_capacity_and_draw_from_their_own_streams(small_run):

@@ -5,8 +5,9 @@ import json
 import math
 
 import pytest
+import torch
 
-from learner.config import AT_LEAST_ONE, RunConfig, config_hash, from_dict, to_dict
+from learner.config import AT_LEAST_ONE, NEWER, RunConfig, config_hash, from_dict, to_dict
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 
@@ -38,6 +39,16 @@ def test_counts_must_be_whole_and_positive(name, value):
         ("learning_rate", [0, -1, math.nan, math.inf]),
         ("learning_rate_end", [0, -1, math.nan, math.inf]),
         ("max_gradient_norm", [0, -1, math.nan]),
+        ("target_update_rate", [0, -0.1, 1.01, math.nan, None]),
+        ("priority_exponent", [-0.1, 1.1, math.nan]),
+        ("importance_exponent_start", [-0.1, 1.1, "0.4"]),
+        ("importance_exponent_end", [-0.1, 1.1, True]),
+        ("replay", ["prioritized", None]),
+        ("network", ["duelling", 2]),
+        ("loss", ["l2", None]),
+        ("target_update", ["polyak", None]),
+        ("learning_rate_schedule", ["constant", None]),
+        ("device", ["gpu", "cuda:0", None]),
         ("hidden_sizes", [(), (0,), (8, -1), (8, 1.5), (True,), 8, "88", None, [8]]),
         ("engine", ["Ray", "", None, ["ray"]]),
         ("exploration", ["greedy", 1]),
@@ -75,6 +86,38 @@ def test_the_learning_rate_falls_linearly_and_stays():
     config = RunConfig(learning_rate=1e-3, learning_rate_end=2e-4, learning_rate_decay_env_steps=1000)
     rates = [config.learning_rate_at(env_steps) for env_steps in (0, 250, 1000, 10**9)]
     assert rates == pytest.approx([1e-3, 8e-4, 2e-4, 2e-4])
+
+
+def test_a_constant_learning_rate_is_an_end_like_the_start():
+    config = RunConfig(learning_rate=1e-3, learning_rate_end=1e-3, learning_rate_decay_env_steps=1000)
+    assert {config.learning_rate_at(env_steps) for env_steps in range(0, 3000, 100)} == {1e-3}
+
+
+def test_the_cosine_schedule_is_pytorchs():
+    config = RunConfig(
+        learning_rate=1e-3,
+        learning_rate_end=2e-4,
+        learning_rate_decay_env_steps=50,
+        learning_rate_schedule="cosine",
+    )
+    optimiser = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1e-3)
+    theirs = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, T_max=50, eta_min=2e-4)
+    for env_steps in range(51):
+        assert config.learning_rate_at(env_steps) == pytest.approx(theirs.get_last_lr()[0], rel=1e-9)
+        optimiser.step()
+        theirs.step()
+    assert config.learning_rate_at(10**9) == pytest.approx(2e-4)
+
+
+def test_the_importance_exponent_changes_linearly_and_stays():
+    config = RunConfig(importance_exponent_start=0.4, importance_exponent_end=0.9, importance_exponent_env_steps=1000)
+    exponents = [config.importance_exponent_at(env_steps) for env_steps in (0, 200, 1000, 10**9)]
+    assert exponents == pytest.approx([0.4, 0.5, 0.9, 0.9])
+
+
+@pytest.mark.parametrize(("network", "expected"), [("plain", (7, 5)), ("dueling", (7, 10))])
+def test_a_policy_acts_with_a_plain_network(network, expected):
+    assert RunConfig(network=network, hidden_sizes=(7, 5)).policy_sizes == expected
 
 
 def test_round_trip_through_json(small_run):
@@ -115,6 +158,12 @@ def changed(config, name):
         "replay_placement": "actors" if value == "learner" else "learner",
         "algorithm": "dqn",
         "gradients": "autograd",
+        "device": "cpu",
+        "replay": "prioritised",
+        "network": "dueling",
+        "loss": "mse",
+        "target_update": "soft",
+        "learning_rate_schedule": "cosine",
         "env_id": "CartPole-v1",
         "world": dataclasses.replace(config.world, reward_scale=2.0),
         "hidden_sizes": (*config.hidden_sizes, 4),
@@ -129,7 +178,13 @@ def test_the_hash_tells_configs_apart_but_for_where_and_how_long(small_run, name
     other = changed(small_run, name)
     assert other != small_run
     same = config_hash(other) == config_hash(small_run)
-    assert same == (name in ("total_env_steps", "engine"))
+    assert same == (name in ("total_env_steps", "engine", "device"))
+
+
+def test_checkpoints_of_before_an_option_existed_still_belong_to_their_configs(small_run):
+    """Hashes of the version that knew none of NEWER."""
+    assert (config_hash(RunConfig()), config_hash(small_run)) == ("2de1403ebdfe", "5f3885464760")
+    assert set(NEWER) <= RunConfig.__dataclass_fields__.keys()
 
 
 def test_the_hash_is_stable(small_run):

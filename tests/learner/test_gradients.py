@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from actors.network import QNetwork
+from actors.network import NETWORKS
 from learner.double_dqn import Batch
 from learner.gradients import AutogradGradients, FlatNetwork, HandWrittenGradients
 
 
-def networks(observation_size, hidden_sizes, num_actions, seed=0):
+def networks(observation_size, hidden_sizes, num_actions, seed=0, kind="plain"):
     torch.manual_seed(seed)
-    return [FlatNetwork(QNetwork(observation_size, hidden_sizes, num_actions)) for _ in range(2)]
+    return [FlatNetwork(NETWORKS[kind](observation_size, hidden_sizes, num_actions)) for _ in range(2)]
 
 
-def random_batch(size, shape, num_actions, seed=0):
+def random_batch(size, shape, num_actions, seed=0, weighted=False):
     rng = np.random.default_rng(seed)
 
     def tensor(array):
@@ -26,34 +26,42 @@ def random_batch(size, shape, num_actions, seed=0):
         r_t=tensor(rng.normal(scale=2, size=size)),  # TD errors on both sides of Huber's corner
         discount_t=tensor(rng.choice([0.0, 0.97], size=size)),
         s_t=tensor(rng.normal(size=(size, *shape))),
+        weight=tensor(rng.uniform(0.1, 1.0, size=size)) if weighted else None,
     )
 
 
+@pytest.mark.parametrize("kind", ["plain", "dueling"])
+@pytest.mark.parametrize(("loss", "weighted"), [("huber", False), ("huber", True), ("mse", False), ("mse", True)])
 @pytest.mark.parametrize("double", [True, False])
 @pytest.mark.parametrize(
     ("shape", "hidden_sizes", "num_actions", "size"),
     [((16,), (128, 128), 8, 256), ((72,), (256, 256), 9, 64), ((3,), (5,), 2, 1), ((2, 4), (7, 6, 5), 4, 33)],
 )
-def test_by_hand_is_autograd(double, shape, hidden_sizes, num_actions, size):
-    online, target = networks(int(np.prod(shape)), hidden_sizes, num_actions)
-    batch = random_batch(size, shape, num_actions)
-    found = HandWrittenGradients(online, target, double)(batch)
-    by_hand = online.values.grad.clone()
+def test_by_hand_is_autograd(double, shape, hidden_sizes, num_actions, size, loss, weighted, kind):
+    online, target = networks(int(np.prod(shape)), hidden_sizes, num_actions, kind=kind)
+    batch = random_batch(size, shape, num_actions, weighted=weighted)
     online.values.grad.fill_(torch.nan)  # what is left of it would show
-    expected = AutogradGradients(online, target, double)(batch)
+    found = HandWrittenGradients(online, target, double, loss)(batch)
+    by_hand = online.values.grad.clone()
+    online.values.grad.fill_(torch.nan)
+    expected = AutogradGradients(online, target, double, loss)(batch)
     assert float(by_hand.abs().max()) > 1e-3
     scale = float(online.values.grad.abs().max())
-    torch.testing.assert_close(by_hand, online.values.grad, rtol=1e-4, atol=2e-6 * scale)
-    torch.testing.assert_close(torch.stack(found), torch.stack(expected), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(by_hand, online.values.grad, rtol=1e-4, atol=3e-6 * scale)
+    torch.testing.assert_close(torch.stack(found[:3]), torch.stack(expected[:3]), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(found.td_errors, expected.td_errors, rtol=1e-5, atol=3e-6)
 
 
-def test_by_hand_is_the_quotient_of_differences():
-    online, target = networks(4, (6, 5), 3, seed=2)
+@pytest.mark.parametrize("kind", ["plain", "dueling"])
+@pytest.mark.parametrize(("loss", "weighted"), [("huber", False), ("mse", True)])
+def test_by_hand_is_the_quotient_of_differences(kind, loss, weighted):
+    online, target = networks(4, (6, 5), 3, seed=2, kind=kind)
     for flat in (online, target):
         flat.network.double()
     online, target = FlatNetwork(online.network), FlatNetwork(target.network)
-    batch = Batch(*(part.double() if part.is_floating_point() else part for part in random_batch(20, (4,), 3)))
-    gradients = HandWrittenGradients(online, target, False)
+    parts = random_batch(20, (4,), 3, weighted=weighted)
+    batch = Batch(*(part.double() if part is not None and part.is_floating_point() else part for part in parts))
+    gradients = HandWrittenGradients(online, target, False, loss)
     gradients(batch)
     slopes, step = online.values.grad.clone(), 1e-6
     for i in range(len(slopes)):
@@ -65,8 +73,9 @@ def test_by_hand_is_the_quotient_of_differences():
         assert float(slopes[i]) == pytest.approx((losses[0] - losses[1]) / (2 * step), abs=1e-7)
 
 
-def test_flat_parameters_are_the_networks():
-    flat, _ = networks(3, (4,), 2)
+@pytest.mark.parametrize("kind", ["plain", "dueling"])
+def test_flat_parameters_are_the_networks(kind):
+    flat, _ = networks(3, (4,), 2, kind=kind)
     before = [parameter.detach().clone() for parameter in flat.network.parameters()]
     assert torch.equal(flat.values.data, torch.cat([parameter.reshape(-1) for parameter in before]))
     flat.values.data.add_(1.0)

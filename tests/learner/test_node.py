@@ -7,10 +7,13 @@ import pytest
 from scipy import stats
 
 from actors.calls import Done, LocalCalls
-from actors.network import WeightsSnapshot
+from actors.network import Policy, WeightsSnapshot
 from actors.nodes import ShardNode, ShardSettings
+from actors.prioritised import SMALLEST, PrioritySettings
 from actors.rollout import join_stats
 from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock
+from learner.double_dqn import importance_weights
+from learner.learner import Learner
 from learner.node import LearnerNode
 
 RATE = 1e-3
@@ -25,9 +28,10 @@ def make_block(rows, sequence=0, worker_id=0, incarnation=0, version=0, schema=S
 def make_learner(learner_settings, make_rows):
     """Function: a learner with embedded shards; also gives the shards."""
 
-    def make(num_shards=1, capacity=50, **other):
-        shards = [ShardNode(ShardSettings(make_rows(0).dtype, capacity, seed)) for seed in range(num_shards)]
-        return LearnerNode(learner_settings._replace(**other), shards, LocalCalls(), LocalCalls()), shards
+    def make(num_shards=1, capacity=50, priorities=None, calls=None, **other):
+        settings = [ShardSettings(make_rows(0).dtype, capacity, seed, priorities) for seed in range(num_shards)]
+        shards = [ShardNode(setting) for setting in settings]
+        return LearnerNode(learner_settings._replace(**other), shards, calls or LocalCalls(), LocalCalls()), shards
 
     return make
 
@@ -78,9 +82,11 @@ class ShardContract:
 
 
 class TestShardInANodeOfItsOwn(ShardContract):
+    priorities = None
+
     @pytest.fixture
     def target(self, make_rows):
-        node, versions = ShardNode(ShardSettings(make_rows(0).dtype, 50, 0)), iter((1, 2))
+        node, versions = ShardNode(ShardSettings(make_rows(0).dtype, 50, 0, self.priorities)), iter((1, 2))
 
         def publish():
             version = next(versions)
@@ -89,16 +95,26 @@ class TestShardInANodeOfItsOwn(ShardContract):
         return node, node, publish
 
 
+class TestPrioritisedShardInANodeOfItsOwn(TestShardInANodeOfItsOwn):
+    priorities = PrioritySettings(0.6, 16)
+
+
 class TestShardEmbeddedInTheLearner(ShardContract):
+    priorities = None
+
     @pytest.fixture
     def target(self, make_learner, make_rows):
-        learner, (shard,) = make_learner()
+        learner, (shard,) = make_learner(priorities=self.priorities)
 
         def publish():
             learner._learner.update(make_rows(16), RATE)
             learner.publish()
 
         return learner, shard, publish
+
+
+class TestPrioritisedShardEmbeddedInTheLearner(TestShardEmbeddedInTheLearner):
+    priorities = PrioritySettings(0.6, 16)
 
 
 def test_embedded_shards_take_blocks_in_turn(make_learner, make_rows):
@@ -127,7 +143,7 @@ def test_rows_of_all_shards_are_drawn_equally_often(make_learner, make_rows, siz
         rows = make_rows(size)
         rows["action"] = 1000 * number + np.arange(size)
         shard.add(make_block(rows))
-    drawn = np.concatenate([learner._sample(900)["action"] for _ in range(20)])
+    drawn = np.concatenate([learner._sample(900).rows["action"] for _ in range(20)])
     counts = [np.bincount(drawn[drawn // 1000 == i] % 1000, minlength=size) for i, size in enumerate(sizes)]
     assert stats.chisquare(np.concatenate(counts)).pvalue > 1e-4
 
@@ -138,7 +154,7 @@ def test_every_minibatch_mixes_the_shards(make_learner, make_rows):
         rows = make_rows(50)
         rows["action"] = number
         shard.add(make_block(rows))
-    means = learner._sample(64 * 16)["action"].reshape(64, 16).mean(axis=1)
+    means = learner._sample(64 * 16).rows["action"].reshape(64, 16).mean(axis=1)
     assert 0.1 < means.min() and means.max() < 0.9
 
 
@@ -152,22 +168,24 @@ def test_an_empty_shard_is_no_obstacle(make_learner, make_rows):
     assert learner.update(2, RATE).version == 4
 
 
+@pytest.mark.parametrize("priorities", [None, PrioritySettings(0.6, 16)])
 @pytest.mark.parametrize("num_shards", [1, 3])
-def test_a_saved_node_goes_on_bit_by_bit(tmp_path, make_learner, make_rows, num_shards):
-    learner, shards = make_learner(num_shards)
+def test_a_saved_node_goes_on_bit_by_bit(tmp_path, make_learner, make_rows, num_shards, priorities):
+    learner, shards = make_learner(num_shards, priorities=priorities)
     for sequence in range(6):
         learner.add(make_block(make_rows(30, seed=sequence), sequence))
-    learner.update(4, RATE)
+    learner.update(4, RATE, 0.5)
     state = json.loads(json.dumps(learner.save(tmp_path)))
-    expected = [learner.update(4, RATE) for _ in range(2)]
-    resumed, again = make_learner(num_shards, seed=99)
+    expected = [learner.update(4, RATE, 0.5) for _ in range(2)]
+    resumed, again = make_learner(num_shards, priorities=priorities, seed=99)
     weights = resumed.load(tmp_path, state)
     assert weights[0].value.version == 4
     for report in expected:
-        other = resumed.update(4, RATE)
+        other = resumed.update(4, RATE, 0.5)
         assert (other.stats, other.version) == (report.stats, report.version)
         for first, second in zip(other.weights[0].value.arrays, report.weights[0].value.arrays, strict=True):
             np.testing.assert_array_equal(first, second)
+    assert [shard.mass() for shard in again] == [shard.mass() for shard in shards]
     assert [shard.add(make_block(make_rows(1), 9)).weights_version for shard in again] == [12] * num_shards
 
 
@@ -198,3 +216,136 @@ def test_a_damaged_file_is_refused(tmp_path, make_learner, content):
         (tmp_path / "learner.safetensors").write_bytes(content)
     with pytest.raises(ValueError, match="cannot be read"):
         learner.load(tmp_path, state)
+
+
+HALF = PrioritySettings(0.5, 16)
+
+
+def numbered(make_rows, count, first):
+    """A block of rows whose rewards tell them apart."""
+    rows = make_rows(count, seed=first)
+    rows["reward"] = first + np.arange(count)
+    return rows
+
+
+def fill(learner, shards, make_rows, sizes):
+    """Rows with rewards 1000 x shard + number in every shard."""
+    for i, (shard, size) in enumerate(zip(shards, sizes, strict=True)):
+        shard.add(make_block(numbered(make_rows, size, 1000 * i)))
+
+
+def td_errors_by_hand(weights, rows):
+    """Of Double DQN before the first update, when both networks are the same: the best next value counts."""
+    policy = Policy(weights)
+    best = policy.values(rows["next_observation"]).max(axis=1)
+    return (
+        rows["reward"] + rows["discount"] * best - policy.values(rows["observation"])[range(len(rows)), rows["action"]]
+    )
+
+
+@pytest.mark.parametrize("sizes", [(40,), (40, 10), (10, 30, 20)])
+def test_td_errors_go_back_to_the_rows_that_they_are_of(make_learner, make_rows, sizes):
+    learner, shards = make_learner(len(sizes), priorities=HALF)
+    fill(learner, shards, make_rows, sizes)
+    weights, sampled, real = learner.weights()[0].value, [], learner._sample
+    learner._sample = lambda count: sampled.append(real(count)) or sampled[0]
+    learner.update(1, RATE, 1.0)
+    drawn = {round(reward) for reward in sampled[0].rows["reward"].tolist()}
+    assert 1 < len(drawn) <= 16
+    for i, (shard, size) in enumerate(zip(shards, sizes, strict=True)):
+        rows = numbered(make_rows, size, 1000 * i)
+        changed = (np.abs(td_errors_by_hand(weights, rows)) + SMALLEST) ** 0.5
+        new = [1000 * i + number in drawn for number in range(size)]
+        np.testing.assert_allclose(shard.shard.priorities, np.where(new, changed, 1.0), rtol=1e-5)
+
+
+@pytest.mark.parametrize("sizes", [(40,), (40, 10), (10, 30, 20)])
+def test_rows_of_all_shards_are_drawn_in_proportion_to_their_priorities(make_learner, make_rows, sizes):
+    learner, shards = make_learner(len(sizes), priorities=HALF)
+    fill(learner, shards, make_rows, sizes)
+    for i, (shard, size) in enumerate(zip(shards, sizes, strict=True)):
+        shard.set_priorities(np.arange(size), np.linspace(0.1, 2 + i, size, dtype=np.float32) ** 2)
+    samples = [learner._sample(1600) for _ in range(20)]
+    drawn = np.concatenate([sample.rows["reward"] for sample in samples]).astype(int)
+    priorities = [shard.shard.priorities for shard in shards]
+    shares = [part / np.concatenate(priorities).sum() for part in priorities]
+    counts = [np.bincount(drawn[drawn // 1000 == i] % 1000, minlength=size) for i, size in enumerate(sizes)]
+    assert stats.chisquare(np.concatenate(counts), len(drawn) * np.concatenate(shares)).pvalue > 1e-4
+    for sample in samples:
+        numbers = sample.rows["reward"].astype(int)
+        expected = [shares[number // 1000][number % 1000] for number in numbers]
+        np.testing.assert_allclose(sample.draws.probability, expected, rtol=1e-9)
+        np.testing.assert_array_equal(sample.draws.number, numbers % 1000)
+        if len(sizes) > 1:
+            np.testing.assert_array_equal(sample.shard, numbers // 1000)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.4, 1.0])
+def test_updates_count_their_rows_by_importance(make_learner, make_rows, learner_settings, exponent):
+    learner, (shard,) = make_learner(priorities=HALF)
+    twin, (other,) = make_learner(priorities=HALF)
+    for copy in (shard, other):
+        copy.add(make_block(make_rows(50)))
+        copy.set_priorities(np.arange(50), np.geomspace(0.1, 9, 50).astype(np.float32))
+    report, plain = learner.update(3, RATE, exponent), Learner(learner_settings)
+    sample = other.sample(3 * 16)
+    probability = other.shard.priorities[sample.draws.number] / other.shard.priorities.sum()
+    plain.update(sample.rows, RATE, importance_weights(probability, 16, exponent))
+    for array, expected in zip(report.weights[0].value.arrays, plain.weights(0.0).arrays, strict=True):
+        np.testing.assert_array_equal(array, expected)
+
+
+class OvertakenCalls(LocalCalls):
+    """Stores a block before every answer, as a rollout worker may."""
+
+    def __init__(self, blocks):
+        self.blocks = blocks
+
+    def start(self, node, method, *args):
+        if method == "set_priorities":
+            node.add(next(self.blocks))
+        return super().start(node, method, *args)
+
+
+def test_rows_that_were_overwritten_meanwhile_keep_their_successors_priorities(make_learner, make_rows):
+    blocks = iter([make_block(make_rows(50, seed=1), 1)])
+    learner, (shard,) = make_learner(priorities=HALF, calls=OvertakenCalls(blocks))
+    shard.add(make_block(make_rows(50)))
+    learner.update(2, RATE, 1.0)
+    assert shard.shard.stale == 32
+    np.testing.assert_array_equal(shard.shard.priorities, np.ones(50))
+
+
+def test_a_checkpoint_waits_for_answers(tmp_path, make_learner, make_rows):
+    """Over Ray an answer is under way when `update` returns."""
+
+    class Late(LocalCalls):
+        late = []
+
+        def start(self, node, method, *args):
+            if method != "set_priorities":
+                return super().start(node, method, *args)
+            self.late.append((node, args))
+            return Done(len(self.late) - 1)
+
+        def get(self, ref):
+            if isinstance(ref.value, int):
+                node, args = self.late[ref.value]
+                return node.set_priorities(*args)
+            return ref.value
+
+    learner, (shard,) = make_learner(priorities=HALF, calls=Late())
+    shard.add(make_block(make_rows(50)))
+    learner.update(2, RATE, 1.0)
+    assert shard.mass() == 50
+    state = learner.save(tmp_path)
+    assert shard.mass() != 50 and state["sizes"] == [shard.mass()]
+
+
+def test_learning_that_has_diverged_ends_the_run(make_learner, make_rows):
+    learner, (shard,) = make_learner(priorities=HALF)
+    rows = make_rows(50)
+    rows["reward"] = np.inf
+    shard.add(make_block(rows))
+    with pytest.raises(ValueError, match="diverged"):
+        learner.update(1, RATE, 1.0)

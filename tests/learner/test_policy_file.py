@@ -1,5 +1,7 @@
 """Reading a policy from a checkpoint."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from actors.vector_env import env_shape
 from learner.checkpoint import CheckpointError, read_checkpoint, write_checkpoint
 from learner.cluster import process_cluster
 from learner.config import RunConfig
-from learner.policy_file import read_policy
+from learner.policy_file import read_policy, read_saved_policy, save_policy
 from sim_core.config import WorldConfig
 
 
@@ -23,6 +25,24 @@ def saved(tmp_path, small_run):
     return checkpoint, learner.weights()[0].value
 
 
+def test_a_dueling_policy_is_kept_as_the_plain_network_that_it_equals(tmp_path, small_run):
+    config = dataclasses.replace(small_run, network="dueling", hidden_sizes=(9, 8))
+    shape, learner = env_shape(config.env), process_cluster(config, 0).learner
+    weights = learner.weights()[0].value
+    save_policy(tmp_path / "policy.safetensors", weights, config, shape)
+    again = read_saved_policy(tmp_path / "policy.safetensors", config, shape)
+    checkpoint = write_checkpoint(tmp_path, 7, lambda folder: {"learner": learner.save(folder), "updates": 42})
+    kept = read_policy(read_checkpoint(checkpoint), config, shape)
+    assert (kept.version, again.version) == (42, 0)
+    assert [len(bias) for bias in weights.arrays[1::2]] == [9, 16, shape.num_actions]
+    for copy in (again, kept):
+        for array, expected in zip(copy.arrays, weights.arrays, strict=True):
+            np.testing.assert_array_equal(array, expected)
+    for other in (dataclasses.replace(config, network="plain"), dataclasses.replace(config, hidden_sizes=(9, 16))):
+        with pytest.raises(CheckpointError, match="network and hidden_sizes"):
+            read_policy(read_checkpoint(checkpoint), other, shape)
+
+
 def test_the_policy_is_the_published_one(saved, small_run):
     checkpoint, published = saved
     weights = read_policy(checkpoint, small_run, env_shape(small_run.env))
@@ -36,7 +56,7 @@ def test_robots_may_differ_but_sectors_may_not(saved, small_run):
     more = RunConfig(world=WorldConfig(robots=9, groups=3, sectors=4), hidden_sizes=(8,))
     read_policy(checkpoint, more, env_shape(more.env))
     for world in (WorldConfig(sectors=5), WorldConfig(sectors=4, stop_action=True)):
-        with pytest.raises(CheckpointError, match="sectors, stop_action, sensor_counts"):
+        with pytest.raises(CheckpointError, match="network, sectors, stop_action, sensor_counts"):
             read_policy(checkpoint, small_run, env_shape(small_run.env._replace(world=world)))
 
 

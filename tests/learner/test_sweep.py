@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from actors.result_table import ResultRow
-from learner.config import to_dict
+from learner.config import RunConfig, to_dict
 from learner.sweep import SweepConfig, cell_hash, done_cells, make_cell, make_cells, other_worlds, wanted
 from sim_core.checks import ConfigError
 
@@ -74,7 +74,8 @@ def test_a_cells_key_tells_apart_all_that_decides_its_results():
         make_cell(dataclasses.replace(SMALL, first_seed=3), "sensor", 5, 2, 0),
     ]
     assert len({cell_hash(cell.config) for cell in [base, *others]}) == 7
-    assert cell_hash(dataclasses.replace(base.config, engine="ray")) == cell_hash(base.config)
+    for where in ({"engine": "ray"}, {"device": "cuda"}):
+        assert cell_hash(dataclasses.replace(base.config, **where)) == cell_hash(base.config)
 
 
 def test_a_setting_that_is_as_by_default_does_not_count(monkeypatch):
@@ -94,6 +95,11 @@ def test_a_setting_that_is_as_by_default_does_not_count(monkeypatch):
 def test_the_length_of_the_training_takes_its_schedule_along():
     config = make_cell(dataclasses.replace(SMALL, env_steps=400_000), "out", 5, 1, 0).config
     assert config.total_env_steps == config.learning_rate_decay_env_steps == 400_000
+    assert config.importance_exponent_env_steps == RunConfig().importance_exponent_env_steps  # nothing hangs on it
+    prioritised = dataclasses.replace(SMALL, env_steps=400_000, set=("replay=prioritised",))
+    assert make_cell(prioritised, "out", 5, 1, 0).config.importance_exponent_env_steps == 400_000
+    given = dataclasses.replace(prioritised, set=("replay=prioritised", "importance_exponent_env_steps=7"))
+    assert make_cell(given, "out", 5, 1, 0).config.importance_exponent_env_steps == 7
     preset = make_cell(SMALL, "out", 5, 1, 0).config
     assert config.epsilon_decay_env_steps / 400_000 == preset.epsilon_decay_env_steps / preset.total_env_steps
 
