@@ -14,11 +14,13 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import tyro  # noqa: E402
 
+from actors.faults import RunFailed  # noqa: E402
 from deploy.options import Command, Evaluate, Report, Resume, Sweep, Train, Watch  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
 from learner.presets import MethodName, PresetName, preset_config  # noqa: E402
 from sim_core.checks import ConfigError, require  # noqa: E402
 
+FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
 
@@ -116,9 +118,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         print(f"shoal: {error}", file=sys.stderr)
         return BAD_INPUT
+    except RunFailed as error:
+        print(f"shoal: {error}", file=sys.stderr)
+        return FAILED
     except KeyboardInterrupt:
         print("shoal: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        return FAILED

@@ -10,6 +10,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from learner.config import RunConfig
+from learner.place import DEADLINE_S, START_DEADLINE_S, Place
 from learner.presets import PresetName
 from learner.sweep import SweepConfig
 from sim_core.checks import require
@@ -29,6 +30,13 @@ class Launch:
     """MLflow experiment."""
     address: str | None = None
     """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
+    deadline_s: float = DEADLINE_S
+    """Seconds of silence after which a part of the run that owes an answer is replaced (Ray only)."""
+    start_deadline_s: float = START_DEADLINE_S
+    """The same for a part that is being started or saved."""
+
+    def __post_init__(self) -> None:
+        check_deadlines(self.deadline_s, self.start_deadline_s)
 
     def tracking(self) -> str:
         """The tracking URI in force."""
@@ -46,6 +54,16 @@ class Launch:
     def ray_address(self) -> str | None:
         """The Ray cluster in force, None for a Ray of its own."""
         return ray_address(self.address)
+
+    def place(self) -> Place:
+        """Where the run's parts go."""
+        return Place(self.ray_address(), self.deadline_s, self.start_deadline_s)
+
+
+def check_deadlines(deadline_s: float, start_deadline_s: float) -> None:
+    """Raises ConfigError for a deadline that a sound part may miss."""
+    require(deadline_s >= 1, f"--deadline-s must be at least 1, not {deadline_s}")
+    require(start_deadline_s >= 1, f"--start-deadline-s must be at least 1, not {start_deadline_s}")
 
 
 def ray_address(given: str | None) -> str | None:
@@ -106,6 +124,17 @@ class Resume:
     """Folder of all runs."""
     address: str | None = None
     """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
+    deadline_s: float = DEADLINE_S
+    """Seconds of silence after which a part of the run that owes an answer is replaced (Ray only)."""
+    start_deadline_s: float = START_DEADLINE_S
+    """The same for a part that is being started or saved."""
+
+    def __post_init__(self) -> None:
+        check_deadlines(self.deadline_s, self.start_deadline_s)
+
+    def place(self) -> Place:
+        """Where the run's parts go."""
+        return Place(ray_address(self.address), self.deadline_s, self.start_deadline_s)
 
 
 @dataclass(frozen=True, kw_only=True)

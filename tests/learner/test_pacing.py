@@ -125,7 +125,7 @@ def test_a_saved_state_decides_the_same(setup, seed):
     pacer.waited(to_insert=False)
     resumed = Pacer(*setup)
     resumed.state = PacingState(**pacer.state._asdict())
-    assert resumed.state == pacer.state and pacer.state[2:] == (1, 2)
+    assert resumed.state == pacer.state and pacer.state[2:4] == (1, 2)
     for _ in range(30):
         assert resumed.updates_due() == pacer.updates_due()
         assert [resumed.may_collect(i) for i in range(4)] == [pacer.may_collect(i) for i in range(4)]
