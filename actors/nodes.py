@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from actors.calls import Calls, Node, Ref
-from actors.faults import Action, CallFailed, PartKind, decide
+from actors.faults import Action, CallFailed, Fault, PartKind, decide
 from actors.network import WeightsSnapshot
 from actors.replay import ReplayShard
 from actors.rollout import RolloutSettings, RolloutWorker
@@ -166,7 +166,12 @@ class RolloutNode:
 
         Returns:
           Reports of the blocks that were stored, or dropped, meanwhile.
+
+        Raises:
+          CallFailed: it never got weights, for they were lost on their way.
         """
+        if self._worker.policy_version < 0:
+            raise CallFailed(Fault.OBJECT_LOST, "it has no weights")
         block = self._worker.collect(rate)
         shard = self._next_shard
         self._next_shard = (self._next_shard + 1) % len(self._shards)

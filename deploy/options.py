@@ -200,4 +200,31 @@ class Watch:
         require(0 <= self.seed < 2**32, f"--seed must be in 0..{2**32 - 1}, not {self.seed}")
 
 
-Command = Train | Sweep | Report | Resume | Evaluate | Watch
+@dataclass(frozen=True, kw_only=True)
+class Chaos:
+    """Train a small run while its processes are killed, frozen and delayed; print how long each took to recover."""
+
+    out: Path = Path("runs/chaos")
+    """New folder for the run, its MLflow server's database and the logs."""
+    seed: int = 0
+    """Seed of the schedule of faults."""
+    env_steps: int = 150_000
+    """Env steps that the run must reach."""
+    faults: int = 1_000
+    """Faults to make at most."""
+    every_s: float = 4.0
+    """Mean time between two faults."""
+    deadline_s: float = 10.0
+    """Seconds of silence after which a part is replaced."""
+    limit_s: float = 3_600.0
+    """The run counts as hanging after so many seconds."""
+
+    def __post_init__(self) -> None:
+        require(self.env_steps > 1_024, f"--env-steps must be above 1024, not {self.env_steps}")
+        require(self.faults >= 0, f"--faults must not be negative, not {self.faults}")
+        require(self.every_s > 0, f"--every-s must be greater than 0, not {self.every_s}")
+        require(self.deadline_s > 4, f"--deadline-s must be above 4, twice the longest delay, not {self.deadline_s}")
+        require(self.limit_s > 0, f"--limit-s must be greater than 0, not {self.limit_s}")
+
+
+Command = Chaos | Train | Sweep | Report | Resume | Evaluate | Watch

@@ -81,12 +81,17 @@ class PushedMark:
         self._path = path
         self.write(min(limit, self.read()))
 
-    def read(self) -> int:
-        """The byte; 0 where nothing is noted."""
+    @staticmethod
+    def value(path: Path) -> int:
+        """The byte that the file `path` notes; 0 where nothing is noted."""
         try:
-            return int(self._path.read_text())
+            return int(path.read_text())
         except (OSError, ValueError):
             return 0
+
+    def read(self) -> int:
+        """The byte; 0 where nothing is noted."""
+        return self.value(self._path)
 
     def write(self, offset: int) -> None:
         """Notes a byte."""

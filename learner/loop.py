@@ -121,7 +121,10 @@ class TrainingLoop:
     def _send_first_weights(self) -> None:
         self._weights = self._mender.ask(LEARNER, "weights")[0]
         for worker in self._workers():
-            self._mender.ask(worker, "set_weights", self._weights)
+            try:
+                self._mender.ask(worker, "set_weights", self._weights)
+            except PartFailed as failure:
+                self._mend(failure)
 
     def _workers(self) -> list[Part]:
         return [Part(PartKind.WORKER, worker_id) for worker_id in range(len(self._cluster.workers))]
@@ -203,12 +206,9 @@ class TrainingLoop:
             self._pacer.inserted(self._ledger.take(report))
             self._meters.take_block(report)
             self.env_steps += report.header.env_steps
-            target = self._mender.target(report.shard)
-            if report.fault is not None:
-                incarnation = report.shard_incarnation if target.kind is PartKind.SHARD else self._cluster.incarnation
-                self._mend(PartFailed(target, incarnation, report.fault, "a push failed"))
-            elif report.shard_incarnation == self._mender.incarnation(target):
-                self._mender.worked(target)
+            failure = self._mender.check_push(report)
+            if failure is not None:
+                self._mend(failure)
 
     def _take_updates(self, report: UpdateReport, updates: int) -> None:
         self._meters.take_updates(report, updates)

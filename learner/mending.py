@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from actors.calls import Node, Ref
 from actors.faults import Action, CallFailed, Decision, Mended, Part, PartFailed, PartKind, Recovery, RunFailed
-from actors.transitions import Delivered
+from actors.transitions import BlockReport, Delivered
 from learner.cluster import Cluster
 from learner.ledger import Ledger
 from learner.pacing import Pacer
@@ -101,6 +101,24 @@ class Mender:
         """What workers push to under this index."""
         return Part(PartKind.SHARD, index) if self._cluster.shards_are_parts else Part(PartKind.LEARNER)
 
+    def check_push(self, report: BlockReport) -> PartFailed | None:
+        """What a worker's push says of where it went; one that went to a replaced shard is told of the new one."""
+        target, pushed_to = self.target(report.shard), report.shard_incarnation
+        if target.kind is PartKind.LEARNER:
+            pushed_to = self._cluster.incarnation
+        elif pushed_to < self.incarnation(target):
+            self._tell(report.header.worker_id, target)
+            return None
+        if report.fault is None:
+            self.worked(target)
+            return None
+        return PartFailed(target, pushed_to, report.fault, "a push to it failed")
+
+    def _tell(self, worker_id: int, shard: Part) -> None:
+        """Names a worker the present incarnation of a shard."""
+        node, incarnation = self.node(shard), self.incarnation(shard)
+        self._cluster.calls.start(self._cluster.workers[worker_id], "replace_shard", shard.number, node, incarnation)
+
     def worked(self, part: Part) -> None:
         """Notes that a part has done a call."""
         mended = self._recovery.worked(part, time.monotonic())
@@ -171,9 +189,9 @@ class Mender:
         self._pacer.inserted(unreported.rows)
         self._under_way.forget(part)
         worker = cluster.workers[index] = cluster.place_worker(index, incarnation)
-        for i, target in enumerate(targets):
+        for target in targets:
             if target in self._incarnations:
-                cluster.calls.start(worker, "replace_shard", i, cluster.targets[i], self._incarnations[target])
+                self._tell(index, target)
         cluster.calls.start(worker, "set_weights", weights)
         return unreported
 
@@ -185,6 +203,6 @@ class Mender:
         self.ask(part, "size")  # others must not wait for it while it starts
         self._pacer.lost(self._ledger.shard_lost(index, incarnation))
         self.ask(Part(PartKind.LEARNER), "replace_shard", index, shard, incarnation)
-        for worker in cluster.workers:
-            cluster.calls.start(worker, "replace_shard", index, shard, incarnation)
+        for worker_id in range(len(cluster.workers)):
+            self._tell(worker_id, part)
         return Delivered()

@@ -60,12 +60,19 @@ class MirroringObserver:
       delivery: carries the journal to MLflow.
       faults: the run's log of faults.
       display: shows all to a person.
+      resumed: whether this process goes on with the run of another one.
     """
 
-    def __init__(self, delivery: Delivery, faults: FaultLog, display: Display) -> None:
+    def __init__(self, delivery: Delivery, faults: FaultLog, display: Display, resumed: bool) -> None:
         self._delivery = delivery
         self._faults = faults
         self._display = display
+        self._resumed = resumed
+
+    def ready(self) -> None:
+        """Logs that the run is where another process left it."""
+        if self._resumed:
+            self._faults.resumed()
 
     def row(self, row: Row) -> None:
         """Shows the row."""
@@ -172,8 +179,7 @@ def _train(
     """Trains to the end, going back to the last checkpoint whenever a part is gone that only it can bring back."""
     recovery, faults = Recovery(), FaultLog(folder.faults)
     incarnation = checkpoint.state["incarnation"] + 1 if checkpoint else 0
-    if checkpoint is not None:
-        faults.resumed()
+    resumed = checkpoint is not None
     while True:
         offset = checkpoint.state["journal_offset"] if checkpoint else 0
         with closing(Journal(folder.journal, offset)) as journal:
@@ -181,7 +187,7 @@ def _train(
             delivery = Delivery(tracker, journal, PushedMark(folder.pushed, offset), display.message)
             delivery.up_to(offset)
             with closing(delivery):
-                observer = MirroringObserver(delivery, faults, display)
+                observer = MirroringObserver(delivery, faults, display, resumed)
                 try:
                     result = _attempt(folder, config, display, checkpoint, journal, cluster, observer, recovery)
                 except RunLost as lost:
@@ -191,6 +197,7 @@ def _train(
                     _deliver_rest(delivery, tracker, result, display)
                     return result, journal.rows()
         cluster.abandon()
+        resumed = False
         checkpoint = _last_checkpoint(folder, config)
         display.message(f"going on from {checkpoint.folder if checkpoint else 'the start'}")
 
@@ -236,6 +243,7 @@ def _attempt(
         try:
             if checkpoint is not None:
                 _restore(loop, checkpoint)
+            observer.ready()
             finished = loop.run()
             if not finished:
                 return RunResult(loop.env_steps, loop.updates, stop.signal, None, None, None)

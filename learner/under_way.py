@@ -118,8 +118,6 @@ class UnderWay:
         late = {part for part, seconds in owing_s.items() if seconds >= self._patience_with(part)}
         owed = {pending.part: pending for pending in self._calls.values() if pending.part in late}
         return [
-            pending.failed(
-                CallFailed(Fault.LATE, f"{pending.kind}: no answer within {self._patience_with(part):.0f} s")
-            )
+            pending.failed(CallFailed(Fault.LATE, f"{pending.kind}: silent for {self._patience_with(part):.0f} s"))
             for part, pending in owed.items()
         ]
