@@ -242,7 +242,5 @@ def chaos(command: Chaos) -> int:
     for complaint in wrong:
         console.print(complaint, markup=False, highlight=False, soft_wrap=True)
     if not wrong:
-        console.print(
-            f"{len(faults)} faults, target reached, accounts balance, MLflow has every row once", highlight=False
-        )
+        console.print(f"{len(faults)} faults; target reached, accounts balance, MLflow has every row once")
     return 1 if wrong else 0

@@ -6,12 +6,15 @@ import time
 from typing import Any, Protocol
 
 from actors.calls import Node, Ref
-from actors.faults import Action, CallFailed, Decision, Mended, Part, PartFailed, PartKind, Recovery, RunFailed
+from actors.faults import Action, CallFailed, Decision, Fault, Mended, Part, PartFailed, PartKind, Recovery, RunFailed
 from actors.transitions import BlockReport, Delivered
 from learner.cluster import Cluster
 from learner.ledger import Ledger
 from learner.pacing import Pacer
 from learner.under_way import UnderWay
+
+SLOW = ("save", "load")
+"""Calls that write or read the whole of a part."""
 
 
 class RunLost(Exception):
@@ -89,8 +92,12 @@ class Mender:
           PartFailed: there is none.
         """
         calls = self._cluster.calls
+        patience_s = self._cluster.start_deadline_s if method in SLOW else self._under_way.patience_with(part)
+        ref = calls.start(self.node(part), method, *args)
         try:
-            answer = calls.get(calls.start(self.node(part), method, *args))
+            if not calls.wait([ref], patience_s):
+                raise CallFailed(Fault.LATE, f"silent for {patience_s:.0f} s")
+            answer = calls.get(ref)
         except CallFailed as failure:
             reason = f"{method}: {failure.reason}"
             raise PartFailed(part, self.incarnation(part), failure.fault, reason) from failure

@@ -104,10 +104,11 @@ class UnderWay:
     def patience_s(self) -> float:
         """Seconds until the next part is late."""
         now_s = self._clock()
-        ends_s = [since_s + self._patience_with(part) for part, since_s in self._owing_since_s.items()]
+        ends_s = [since_s + self.patience_with(part) for part, since_s in self._owing_since_s.items()]
         return max(0.0, min(ends_s, default=now_s) - now_s)
 
-    def _patience_with(self, part: Part) -> float:
+    def patience_with(self, part: Part) -> float:
+        """How long the part may be silent."""
         return self._deadline_s if part in self._started else self._start_deadline_s
 
     def late(self, ready: list[Ref]) -> list[PartFailed]:
@@ -115,9 +116,9 @@ class UnderWay:
         now_s = self._clock()
         answered = {self._calls[ref].part for ref in ready}
         owing_s = {part: now_s - since_s for part, since_s in self._owing_since_s.items() if part not in answered}
-        late = {part for part, seconds in owing_s.items() if seconds >= self._patience_with(part)}
+        late = {part for part, seconds in owing_s.items() if seconds >= self.patience_with(part)}
         owed = {pending.part: pending for pending in self._calls.values() if pending.part in late}
         return [
-            pending.failed(CallFailed(Fault.LATE, f"{pending.kind}: silent for {self._patience_with(part):.0f} s"))
+            pending.failed(CallFailed(Fault.LATE, f"{pending.kind}: silent for {self.patience_with(part):.0f} s"))
             for part, pending in owed.items()
         ]
