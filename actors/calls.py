@@ -26,12 +26,12 @@ class Calls(Protocol):
         """Starts `function(*args)`, anywhere, with references as in `start`."""
         ...
 
-    def wait(self, refs: list[Ref]) -> list[Ref]:
-        """Blocks until at least one of `refs` is there; returns those that are, in the given order."""
+    def wait(self, refs: list[Ref], timeout_s: float) -> list[Ref]:
+        """Blocks until one of `refs` is there or the time is over; returns those that are there, in the given order."""
         ...
 
     def get(self, ref: Ref) -> Any:
-        """The result behind `ref`; raises what the call raised."""
+        """The result behind `ref`; raises what the call raised, or CallFailed if it could not be made."""
         ...
 
     def put(self, value: Any) -> Ref:
@@ -61,7 +61,7 @@ class LocalCalls:
         """Runs `function(*args)`."""
         return Done(function(*_values(args)))
 
-    def wait(self, refs: list[Ref]) -> list[Ref]:
+    def wait(self, refs: list[Ref], timeout_s: float) -> list[Ref]:
         """All of `refs`: every call has ended."""
         return list(refs)
 

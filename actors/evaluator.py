@@ -5,7 +5,7 @@ Learned policies, which act greedily, and baselines are played by the same loop.
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import count, pairwise
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from actors.baselines import Baseline, Player, make_baseline
 from actors.calls import Calls, Ref
+from actors.faults import Action, CallFailed, PartKind, decide
 from actors.network import Policy, WeightsSnapshot
 from actors.rollout import join_stats
 from actors.trajectory import NO_ACTION, Episode
@@ -76,11 +77,28 @@ def evaluate_in_parts(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: list[i
 
     Returns:
       One entry a seed, in order.
+
+    Raises:
+      CallFailed: one of the calls fails again and again.
     """
     parts = min(parts, len(seeds))
     bounds = [len(seeds) * i // parts for i in range(parts + 1)] if parts else []
-    refs = [calls.run(evaluate, spec, candidate, seeds[begin:end]) for begin, end in pairwise(bounds)]
-    return join_stats([calls.get(ref) for ref in refs])
+    chunks = [seeds[begin:end] for begin, end in pairwise(bounds)]
+    refs = [calls.run(evaluate, spec, candidate, chunk) for chunk in chunks]
+    return join_stats([_played(calls, spec, candidate, *call) for call in zip(chunks, refs, strict=True)])
+
+
+def _played(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: list[int], ref: Ref) -> EpisodeStats:
+    """What a call of `evaluate` gave; it is made again as long as the decision table says so."""
+    for attempt in count(1):
+        try:
+            stats: EpisodeStats = calls.get(ref)
+            return stats
+        except CallFailed as failure:
+            if decide(PartKind.EVALUATOR, failure.fault, attempt, 0.0) is Action.STOP:
+                raise
+            ref = calls.run(evaluate, spec, candidate, seeds)
+    raise AssertionError("count never ends")
 
 
 class _Step(NamedTuple):

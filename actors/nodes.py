@@ -17,11 +17,15 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from actors.calls import Calls, Node, Ref
+from actors.faults import Action, CallFailed, Fault, PartKind, decide
 from actors.network import WeightsSnapshot
 from actors.prioritised import PrioritisedShard, PrioritySettings
 from actors.replay import ReplayShard
 from actors.rollout import RolloutSettings, RolloutWorker
-from actors.transitions import AddReply, BlockReport, SampleReply, TransitionBlock
+from actors.transitions import AddReply, BlockReport, Delivered, Dropped, SampleReply, TransitionBlock
+
+REMEMBERED_BLOCKS = 8
+"""Blocks of a worker that a shard knows one by one; more than may be under way at once."""
 
 
 class ShardSettings(NamedTuple):
@@ -48,6 +52,8 @@ class ShardNode:
         self.shard = make_shard(settings)
         self._version = -1
         self._weights: Ref = None
+        self._known: dict[int, deque[tuple[int, int]]] = {}
+        self._delivered: dict[int, tuple[int, Delivered]] = {}
 
     def publish(self, version: int, weights: list[Ref]) -> None:
         """Hands out `weights[0]`, a reference in a list so that it travels as one, from now on."""
@@ -56,8 +62,34 @@ class ShardNode:
     def add(self, block: TransitionBlock) -> AddReply:
         """Stores a block; the reply carries newer weights than the block's, if there are any."""
         stored = self.shard.add(block)
-        newer = self._version > block.header.policy_version
-        return AddReply(stored.rows, stored.duplicate, self._version, self._weights if newer else None)
+        header = block.header
+        known = self._known.setdefault(header.worker_id, deque(maxlen=REMEMBERED_BLOCKS))
+        outdated = stored.duplicate and (header.incarnation, header.sequence) not in known
+        if not stored.duplicate:
+            known.append((header.incarnation, header.sequence))
+            self._note_delivery(block)
+        newer = self._version > header.policy_version
+        return AddReply(stored.rows, stored.duplicate, self._version, self._weights if newer else None, outdated)
+
+    def _note_delivery(self, block: TransitionBlock) -> None:
+        header = block.header
+        before = self._delivered_by(header.worker_id, header.incarnation)
+        now = Delivered(
+            before.rows + len(block.rows),
+            before.env_steps + header.env_steps,
+            before.episodes + len(block.episodes.outcome),
+            max(before.made, header.made),
+        )
+        self._delivered[header.worker_id] = (header.incarnation, now)
+
+    def _delivered_by(self, worker_id: int, incarnation: int) -> Delivered:
+        known, delivered = self._delivered.get(worker_id, (incarnation, Delivered()))
+        return delivered if known == incarnation else Delivered()
+
+    def fence(self, worker_id: int, closed: int, incarnation: int) -> Delivered:
+        """Refuses blocks of a worker from before `incarnation` from now on; returns what was stored of `closed`."""
+        self.shard.fence(worker_id, incarnation)
+        return self._delivered_by(worker_id, closed)
 
     def sample(self, count: int) -> SampleReply:
         """Draws `count` rows."""
@@ -86,6 +118,31 @@ class ShardNode:
         self.shard.load(path, state)
 
 
+class _Push(NamedTuple):
+    """A push under way: which block to which incarnation of which shard, and the how manieth attempt it is."""
+
+    block: TransitionBlock
+    shard: int
+    incarnation: int
+    attempt: int
+    ref: Ref
+
+
+def _report(push: _Push, reply: AddReply, dropped: Dropped | None) -> BlockReport:
+    header = push.block.header
+    return BlockReport(
+        header=header,
+        episodes=push.block.episodes,
+        stored=reply.stored,
+        staleness_updates=max(0, reply.weights_version - header.policy_version),
+        staleness_s=time.time() - header.policy_time_s,
+        rows=len(push.block.rows),
+        shard=push.shard,
+        shard_incarnation=push.incarnation,
+        dropped=dropped,
+    )
+
+
 class RolloutNode:
     """A rollout worker that pushes its blocks to the shards in turn.
 
@@ -111,10 +168,15 @@ class RolloutNode:
     ) -> None:
         self._worker = RolloutWorker(settings, worker_id, incarnation)
         self._calls = calls
-        self._shards = shards
+        self._shards = list(shards)
+        self._shard_incarnations = [0] * len(shards)
         self._next_shard = worker_id % len(shards)
         self._limit = pushes_in_flight
-        self._pushes: deque[tuple[TransitionBlock, Ref]] = deque()
+        self._pushes: deque[_Push] = deque()
+
+    def replace_shard(self, index: int, shard: Node, incarnation: int) -> None:
+        """Pushes to `shard` from now on where it pushed to the shard of this index."""
+        self._shards[index], self._shard_incarnations[index] = shard, incarnation
 
     def set_weights(self, weights: WeightsSnapshot) -> None:
         """Acts with these weights."""
@@ -124,13 +186,22 @@ class RolloutNode:
         """Collects one block with exploration rate `rate` and pushes it.
 
         Returns:
-          Reports of the blocks that were stored meanwhile.
+          Reports of the blocks that were stored, or dropped, meanwhile.
+
+        Raises:
+          CallFailed: it never got weights, for they were lost on their way.
         """
+        if self._worker.policy_version < 0:
+            raise CallFailed(Fault.OBJECT_LOST, "it has no weights")
         block = self._worker.collect(rate)
-        shard = self._shards[self._next_shard]
+        shard = self._next_shard
         self._next_shard = (self._next_shard + 1) % len(self._shards)
-        self._pushes.append((block, self._calls.start(shard, "add", block)))
+        self._pushes.append(self._push(block, shard, 1))
         return self._confirm(self._limit)
+
+    def _push(self, block: TransitionBlock, shard: int, attempt: int) -> _Push:
+        ref = self._calls.start(self._shards[shard], "add", block)
+        return _Push(block, shard, self._shard_incarnations[shard], attempt, ref)
 
     def settle(self) -> list[BlockReport]:
         """Waits for every push under way; returns their reports."""
@@ -139,20 +210,33 @@ class RolloutNode:
     def _confirm(self, limit: int) -> list[BlockReport]:
         reports = []
         while len(self._pushes) > limit:
-            block, ref = self._pushes.popleft()
-            reports.append(self._report(block, self._calls.get(ref)))
+            reports.append(self._settled(self._pushes.popleft()))
         return reports
 
-    def _report(self, block: TransitionBlock, reply: AddReply) -> BlockReport:
-        if reply.weights is not None and reply.weights_version > self._worker.policy_version:
+    def _settled(self, push: _Push) -> BlockReport:
+        """Waits for a push, which is tried again where that is harmless: the shard knows the blocks it has."""
+        while True:
+            try:
+                reply: AddReply = self._calls.get(push.ref)
+            except CallFailed as failure:
+                if decide(PartKind.SHARD, failure.fault, push.attempt, 0.0) is not Action.RETRY:
+                    return _report(push, AddReply(0, False, -1, None), Dropped.SHARD_LOST)._replace(fault=failure.fault)
+                push = self._push(push.block, push.shard, push.attempt + 1)
+                continue
+            self._take_weights(reply)
+            if not reply.duplicate:
+                return _report(push, reply, None)
+            if push.attempt > 1 and not reply.outdated:  # an attempt before had stored it
+                return _report(push, reply._replace(stored=len(push.block.rows)), None)
+            return _report(push, reply, Dropped.OUTDATED if reply.outdated else Dropped.DUPLICATE)
+
+    def _take_weights(self, reply: AddReply) -> None:
+        if reply.weights is None or reply.weights_version <= self._worker.policy_version:
+            return
+        try:
             self._worker.set_weights(self._calls.get(reply.weights))
-        return BlockReport(
-            header=block.header,
-            episodes=block.episodes,
-            stored=reply.stored,
-            staleness_updates=max(0, reply.weights_version - block.header.policy_version),
-            staleness_s=time.time() - block.header.policy_time_s,
-        )
+        except CallFailed:
+            return  # lost with the learner that made them; the next learner's come with the replies to come
 
     def save(self, path: Path) -> dict[str, Any]:
         """Writes the worker's arrays to `path`; returns the rest of its state, for JSON.

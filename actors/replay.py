@@ -83,6 +83,11 @@ class ReplayShard:
         self._write(block.rows)
         return Stored(len(block.rows), False)
 
+    def fence(self, worker_id: int, incarnation: int) -> None:
+        """Refuses blocks of older starts of a worker from now on."""
+        fence = (incarnation, -1)
+        self._newest[worker_id] = max(self._newest.get(worker_id, fence), fence)
+
     def _is_new(self, header: BlockHeader) -> bool:
         last = self._newest.get(header.worker_id)
         return last is None or (header.incarnation, header.sequence) > last

@@ -47,6 +47,7 @@ class RolloutWorker:
         self._worker_id = worker_id
         self._incarnation = incarnation
         self._sequence = 0
+        self._made = 0
         self._env = make_vector_env(settings.env, settings.num_envs)
         shape = spaces_of(self._env)
         self._num_actions = shape.num_actions
@@ -80,6 +81,8 @@ class RolloutWorker:
             raise RuntimeError("a rollout worker needs weights before it collects")
         steps = empty_steps(self._settings.steps_per_block, self._settings.num_envs, self._dtype)
         ended = [self._step(self._policy, rate, steps, i) for i in range(self._settings.steps_per_block)]
+        rows = self._nstep.push(steps)
+        self._made += len(rows)
         weights = self._policy.weights
         header = BlockHeader(
             schema_version=SCHEMA_VERSION,
@@ -90,9 +93,10 @@ class RolloutWorker:
             policy_time_s=weights.time_s,
             epsilon=rate,
             env_steps=self._settings.steps_per_block * self._settings.num_envs,
+            made=self._made,
         )
         self._sequence += 1
-        return TransitionBlock(header, self._nstep.push(steps), join_stats([stats for stats in ended if stats]))
+        return TransitionBlock(header, rows, join_stats([stats for stats in ended if stats]))
 
     def _step(self, policy: Policy, rate: float, steps: Steps, i: int) -> EpisodeStats | None:
         """One step of every environment, written as step i of `steps`; the episodes that it ended, if any."""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-SCHEMA_VERSION = 1
+from actors.faults import Fault
+
+SCHEMA_VERSION = 2
 """Version of the block layout; a shard refuses any other."""
 
 NO_OUTCOME = -1
@@ -27,7 +30,8 @@ class BlockHeader(NamedTuple):
     """Where a block comes from.
 
     `incarnation` counts the starts of worker `worker_id`, `sequence` its blocks. `policy_version` is the
-    number of updates behind the weights that acted, `policy_time_s` the wall time of their publication.
+    number of updates behind the weights that acted, `policy_time_s` the wall time of their publication. `made`
+    counts the transitions of this incarnation, this block's included.
     """
 
     schema_version: int
@@ -38,6 +42,7 @@ class BlockHeader(NamedTuple):
     policy_time_s: float
     epsilon: float
     env_steps: int
+    made: int = 0
 
 
 class TransitionBlock(NamedTuple):
@@ -51,23 +56,56 @@ class TransitionBlock(NamedTuple):
 class AddReply(NamedTuple):
     """A shard's answer to a push: what was stored, and newer weights if there are any.
 
-    `weights` is a reference to a WeightsSnapshot, None if the block came from the newest version.
+    `weights` is a reference to a WeightsSnapshot, None if the block came from the newest version. A `duplicate` is
+    refused; it is `outdated` if it was never stored, for its worker has been replaced or a later block overtook it.
     """
 
     stored: int
     duplicate: bool
     weights_version: int
     weights: Any
+    outdated: bool = False
+
+
+class Dropped(StrEnum):
+    """Why a transition that was made is not stored."""
+
+    DUPLICATE = "duplicate"
+    """It is stored already."""
+    OUTDATED = "outdated"
+    """A later block overtook it."""
+    SHARD_LOST = "shard lost"
+    """The shard that it was sent to is gone."""
+    WORKER_LOST = "worker lost"
+    """Its worker went before it was pushed."""
 
 
 class BlockReport(NamedTuple):
-    """What the training loop learns of a stored block; no transitions."""
+    """What the training loop learns of a block; no transitions.
+
+    `shard` and its incarnation say where it was pushed, `rows` how many transitions it holds; with a reason in
+    `dropped` none of them is stored, because of `fault` if the shard failed.
+    """
 
     header: BlockHeader
     episodes: EpisodeStats
     stored: int
     staleness_updates: int
     staleness_s: float
+    rows: int = 0
+    shard: int = 0
+    shard_incarnation: int = 0
+    dropped: Dropped | None = None
+    fault: Fault | None = None
+
+
+class Delivered(NamedTuple):
+    """What a shard has stored of one incarnation of a worker; `made` is the highest count in its headers."""
+
+    rows: int = 0
+    env_steps: int = 0
+    episodes: int = 0
+    made: int = 0
 
 
 class Draws(NamedTuple):

@@ -14,12 +14,14 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import tyro  # noqa: E402
 
-from deploy.options import Command, Evaluate, Report, Resume, Sweep, Train, Watch  # noqa: E402
+from actors.faults import RunFailed  # noqa: E402
+from deploy.options import Chaos, Command, Evaluate, Report, Resume, Sweep, Train, Watch  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
 from learner.presets import PresetName, preset_config  # noqa: E402
 from sim_core.checks import ConfigError, require  # noqa: E402
 from sim_core.config import MethodName  # noqa: E402
 
+FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
 
@@ -79,6 +81,7 @@ def parse(arguments: Sequence[str]) -> Command:
         | Annotated[Resume, tyro.conf.subcommand("resume")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
         | Annotated[Watch, tyro.conf.subcommand("watch")]
+        | Annotated[Chaos, tyro.conf.subcommand("chaos")]
     )
     options = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagConversionOff)
     command: Command = tyro.cli(
@@ -86,7 +89,7 @@ def parse(arguments: Sequence[str]) -> Command:
         prog="shoal",
         args=list(arguments),
         config=options,
-        description="Teach one robot to move with its swarm: train, sweep, report, resume, evaluate and watch.",
+        description="Teach one robot to move with its swarm: train, sweep, report, resume, evaluate, watch, and chaos.",
     )
     return command
 
@@ -105,6 +108,10 @@ def execute(command: Command) -> int:
         from deploy.report import report
 
         return report(command)
+    if isinstance(command, Chaos):
+        from deploy.chaos import chaos
+
+        return chaos(command)
     from deploy import playing
 
     return playing.evaluate(command) if isinstance(command, Evaluate) else playing.watch(command)
@@ -117,9 +124,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         print(f"shoal: {error}", file=sys.stderr)
         return BAD_INPUT
+    except RunFailed as error:
+        print(f"shoal: {error}", file=sys.stderr)
+        return FAILED
     except KeyboardInterrupt:
         print("shoal: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        return FAILED

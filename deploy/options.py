@@ -10,6 +10,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from learner.config import RunConfig
+from learner.place import DEADLINE_S, START_DEADLINE_S, Place
 from learner.presets import PresetName
 from learner.sweep import SweepConfig
 from sim_core.checks import require
@@ -30,6 +31,13 @@ class Launch:
     """MLflow experiment."""
     address: str | None = None
     """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
+    deadline_s: float = DEADLINE_S
+    """Seconds of silence after which a part of the run that owes an answer is replaced (Ray only)."""
+    start_deadline_s: float = START_DEADLINE_S
+    """The same for a part that is being started or saved."""
+
+    def __post_init__(self) -> None:
+        check_deadlines(self.deadline_s, self.start_deadline_s)
 
     def tracking(self) -> str:
         """The tracking URI in force."""
@@ -47,6 +55,16 @@ class Launch:
     def ray_address(self) -> str | None:
         """The Ray cluster in force, None for a Ray of its own."""
         return ray_address(self.address)
+
+    def place(self) -> Place:
+        """Where the run's parts go."""
+        return Place(self.ray_address(), self.deadline_s, self.start_deadline_s)
+
+
+def check_deadlines(deadline_s: float, start_deadline_s: float) -> None:
+    """Raises ConfigError for a deadline that a sound part may miss."""
+    require(deadline_s >= 1, f"--deadline-s must be at least 1, not {deadline_s}")
+    require(start_deadline_s >= 1, f"--start-deadline-s must be at least 1, not {start_deadline_s}")
 
 
 def ray_address(given: str | None) -> str | None:
@@ -109,6 +127,17 @@ class Resume:
     """Folder of all runs."""
     address: str | None = None
     """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
+    deadline_s: float = DEADLINE_S
+    """Seconds of silence after which a part of the run that owes an answer is replaced (Ray only)."""
+    start_deadline_s: float = START_DEADLINE_S
+    """The same for a part that is being started or saved."""
+
+    def __post_init__(self) -> None:
+        check_deadlines(self.deadline_s, self.start_deadline_s)
+
+    def place(self) -> Place:
+        """Where the run's parts go."""
+        return Place(ray_address(self.address), self.deadline_s, self.start_deadline_s)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,4 +203,31 @@ class Watch:
         require(0 <= self.seed < 2**32, f"--seed must be in 0..{2**32 - 1}, not {self.seed}")
 
 
-Command = Train | Sweep | Report | Resume | Evaluate | Watch
+@dataclass(frozen=True, kw_only=True)
+class Chaos:
+    """Train a small run while its processes are killed, frozen and delayed; print how long each took to recover."""
+
+    out: Path = Path("runs/chaos")
+    """New folder for the run, its MLflow server's database and the logs."""
+    seed: int = 0
+    """Seed of the schedule of faults."""
+    env_steps: int = 150_000
+    """Env steps that the run must reach."""
+    faults: int = 1_000
+    """Faults to make at most."""
+    every_s: float = 4.0
+    """Mean time between two faults."""
+    deadline_s: float = 10.0
+    """Seconds of silence after which a part is replaced."""
+    limit_s: float = 3_600.0
+    """The run counts as hanging after so many seconds."""
+
+    def __post_init__(self) -> None:
+        require(self.env_steps > 1_024, f"--env-steps must be above 1024, not {self.env_steps}")
+        require(self.faults >= 0, f"--faults must not be negative, not {self.faults}")
+        require(self.every_s > 0, f"--every-s must be greater than 0, not {self.every_s}")
+        require(self.deadline_s > 4, f"--deadline-s must be above 4, twice the longest delay, not {self.deadline_s}")
+        require(self.limit_s > 0, f"--limit-s must be greater than 0, not {self.limit_s}")
+
+
+Command = Chaos | Train | Sweep | Report | Resume | Evaluate | Watch

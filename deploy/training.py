@@ -13,13 +13,14 @@ from actors.baselines import Baseline
 from actors.vector_env import env_shape
 from deploy.artifacts import log_artifacts
 from deploy.folders import check_plain_name, make_folder
-from deploy.options import Launch, Resume, Train, ray_address
+from deploy.options import Launch, Resume, Train
 from deploy.progress import make_display
 from deploy.tables import evaluation_table, summary_lines
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.journal import Row
 from learner.learner import learning_device
+from learner.place import Place
 from learner.run import RunResult, execute, resume_point
 from learner.run_folder import RunFolder, RunIdentity, find_run
 from learner.tracker import Tracker
@@ -46,22 +47,28 @@ def train(command: Train) -> int:
     folder = _new_folder(config, launch)
     make_folder(launch.runs_dir, "--runs-dir")
     env_shape(config.env)  # refuses an environment that cannot be made
-    _check_device(config, launch.ray_address())
+    _check_device(config, launch.place().address)
     tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
     tracker.start(config)
-    folder.save_config(config)
-    folder.save_identity(RunIdentity(config.name, tracker.uri, launch.experiment, tracker.run_id))
-    return _run(folder, config, tracker, None, launch.ray_address())
+    with folder.hold():
+        folder.save_config(config)
+        folder.save_identity(RunIdentity(config.name, tracker.uri, launch.experiment, tracker.run_id))
+        return _run(folder, config, tracker, None, launch.place())
 
 
 def resume(command: Resume) -> int:
     """Goes on with a run; returns the exit code."""
     folder = find_run(command.run, command.runs_dir)
+    with folder.hold():
+        return _resume(folder, command)
+
+
+def _resume(folder: RunFolder, command: Resume) -> int:
     config, identity = folder.config(), folder.identity()
     checkpoint, skipped = resume_point(folder, config)
     config = _extended(config, command.total_env_steps, checkpoint.state["env_steps"])
     config = dataclasses.replace(config, device=command.device or config.device)
-    _check_device(config, ray_address(command.address))
+    _check_device(config, command.place().address)
     tracker = Tracker(identity.tracking_uri, identity.experiment, None)
     tracker.resume(identity.mlflow_run_id)
     folder.save_config(config)
@@ -69,7 +76,7 @@ def resume(command: Resume) -> int:
     for reason in skipped:
         console.print(f"skipped: {reason}", highlight=False)
     console.print(f"going on from {checkpoint.folder}", highlight=False, soft_wrap=True)
-    return _run(folder, config, tracker, checkpoint, ray_address(command.address))
+    return _run(folder, config, tracker, checkpoint, command.place())
 
 
 def _check_device(config: RunConfig, address: str | None) -> None:
@@ -89,9 +96,7 @@ def _extended(config: RunConfig, total_env_steps: int | None, done: int) -> RunC
     return config
 
 
-def _run(
-    folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, address: str | None
-) -> int:
+def _run(folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, place: Place) -> int:
     console = Console()
     console.print(f"run {folder.path}", highlight=False, soft_wrap=True)
     with make_display(console, config.total_env_steps) as display:
@@ -100,7 +105,7 @@ def _run(
             display.message("logging curve, animation and policy")
             log_artifacts(folder, config, tracker, result, rows)
 
-        result = execute(folder, config, tracker, display, checkpoint, address, finish)
+        result = execute(folder, config, tracker, display, checkpoint, place, finish)
     if result.evaluation is None:
         name = signal.Signals(result.stopped_by).name if result.stopped_by else "a signal"
         console.print(f"stopped by {name} at {result.env_steps:,} env steps; checkpoint saved", highlight=False)

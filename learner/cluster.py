@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,20 +20,38 @@ from learner.node import LearnerNode
 
 
 class Cluster(NamedTuple):
-    """Nodes of a run, and how many calls each may have under way.
+    """Nodes of a run, how to replace them, and how many calls each may have under way.
 
-    `collects_in_flight` counts collects per worker, `updates_in_flight` calls of updates, `eval_tasks` the
-    tasks of one final evaluation; `close` frees everything.
+    Workers push to `targets`: to shards that are parts of their own, or to the learner alone. `place_worker` and
+    `place_shard` take an index and an incarnation; `discard` ends a node or a call. A part that is silent for
+    `deadline_s` is late, one that has not answered yet for `start_deadline_s`. `collects_in_flight` counts
+    collects per worker, `updates_in_flight` calls of updates, `eval_tasks` the tasks of one final evaluation.
+    `abandon` ends all parts, `close` frees everything.
     """
 
     calls: Calls
+    incarnation: int
     learner: Node
     workers: list[Node]
+    targets: list[Node]
+    shards_are_parts: bool
+    place_worker: Callable[[int, int], Node]
+    place_shard: Callable[[int, int], Node]
+    discard: Callable[[Any], None]
+    deadline_s: float
+    start_deadline_s: float
     collects_in_flight: int
     blocks_in_flight: int
     updates_in_flight: int
     eval_tasks: int
+    abandon: Callable[[], None]
     close: Callable[[], None]
+
+    def capacities(self, config: RunConfig) -> list[int]:
+        """Transitions that each target can hold."""
+        if not self.shards_are_parts:
+            return [config.replay_capacity]
+        return [config.replay_capacity // config.replay_shards] * config.replay_shards
 
 
 def learner_settings(config: RunConfig, shape: EnvShape) -> LearnerSettings:
@@ -66,9 +85,10 @@ def rollout_settings(config: RunConfig) -> RolloutSettings:
     )
 
 
-def shard_settings(config: RunConfig, shape: EnvShape) -> list[ShardSettings]:
-    """The shards' part of the config, one a shard."""
-    seeds = np.random.SeedSequence((config.seed, 2)).generate_state(config.replay_shards)
+def shard_settings(config: RunConfig, shape: EnvShape, incarnation: int = 0) -> list[ShardSettings]:
+    """The shards' part of the config, one a shard; a shard that replaces a lost one draws from another stream."""
+    entropy = (config.seed, 2, incarnation) if incarnation else (config.seed, 2)
+    seeds = np.random.SeedSequence(entropy).generate_state(config.replay_shards)
     capacity = config.replay_capacity // config.replay_shards
     dtype = transition_dtype(shape.observation_space)
     priorities = None
@@ -84,17 +104,26 @@ def process_cluster(config: RunConfig, incarnation: int) -> Cluster:
     shards: list[Node] = [ShardNode(settings) for settings in shard_settings(config, shape)]
     learner = LearnerNode(learner_settings(config, shape), shards, calls, calls)
     targets = [learner] if config.replay_placement == "learner" else shards
-    workers: list[Node] = [
-        RolloutNode(rollout_settings(config), worker_id, incarnation, calls, targets, 0)
-        for worker_id in range(config.workers)
-    ]
+
+    def place_worker(worker_id: int, incarnation: int) -> Node:
+        return RolloutNode(rollout_settings(config), worker_id, incarnation, calls, targets, 0)
+
     return Cluster(
         calls=calls,
+        incarnation=incarnation,
         learner=learner,
-        workers=workers,
+        workers=[place_worker(worker_id, incarnation) for worker_id in range(config.workers)],
+        targets=targets,
+        shards_are_parts=config.replay_placement == "actors",
+        place_worker=place_worker,
+        place_shard=lambda index, incarnation: ShardNode(shard_settings(config, shape, incarnation)[index]),
+        discard=lambda node: None,
+        deadline_s=math.inf,
+        start_deadline_s=math.inf,
         collects_in_flight=1,
         blocks_in_flight=config.workers,
         updates_in_flight=1,
         eval_tasks=1,
+        abandon=lambda: None,
         close=lambda: None,
     )

@@ -56,12 +56,13 @@ class Journal:
         os.fsync(self._file.fileno())
         return self._file.tell()
 
-    def rows(self, start: int = 0) -> list[Row]:
-        """The rows from byte `start` on."""
+    def rows(self, start: int = 0, end: int | None = None) -> list[Row]:
+        """The rows from byte `start` on, up to byte `end`; any thread may ask."""
         self._file.flush()
         with self._path.open("rb") as file:
             file.seek(start)
-            return [Row(*json.loads(line)) for line in file]
+            lines = file.read(-1 if end is None else max(0, end - start)).splitlines()
+        return [Row(*json.loads(line)) for line in lines]
 
     def close(self) -> None:
         """Closes the file."""
@@ -80,12 +81,17 @@ class PushedMark:
         self._path = path
         self.write(min(limit, self.read()))
 
-    def read(self) -> int:
-        """The byte; 0 where nothing is noted."""
+    @staticmethod
+    def value(path: Path) -> int:
+        """The byte that the file `path` notes; 0 where nothing is noted."""
         try:
-            return int(self._path.read_text())
+            return int(path.read_text())
         except (OSError, ValueError):
             return 0
+
+    def read(self) -> int:
+        """The byte; 0 where nothing is noted."""
+        return self.value(self._path)
 
     def write(self, offset: int) -> None:
         """Notes a byte."""

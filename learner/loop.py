@@ -8,27 +8,34 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from actors.calls import Ref
 from actors.evaluator import evaluate, evaluate_in_parts
 from actors.exploration import epsilon
+from actors.faults import CallFailed, Part, PartFailed, PartKind, Recovery, RunFailed
 from actors.network import WeightsSnapshot
 from actors.transitions import BlockReport, EpisodeStats
 from learner.checkpoint import Checkpoint, keep_newest, write_checkpoint
 from learner.cluster import Cluster
 from learner.config import RunConfig, config_hash
 from learner.journal import Journal, Row
+from learner.ledger import Ledger
+from learner.mending import FaultObserver, Mender, RunLost
 from learner.meters import Meters
 from learner.node import UpdateReport
 from learner.pacing import PacingState, make_pacer
 from learner.results import as_metrics, summarise
+from learner.under_way import Pending, UnderWay
 
 EVAL_SEED = 1_000_000_000
 """First seed of evaluations during training; training worlds draw theirs from other streams."""
 
 
-class Observer(Protocol):
+LEARNER, EVALUATOR = Part(PartKind.LEARNER), Part(PartKind.EVALUATOR)
+
+
+class Observer(FaultObserver, Protocol):
     """What the loop tells its surroundings."""
 
     def row(self, row: Row) -> None:
@@ -38,14 +45,6 @@ class Observer(Protocol):
     def checkpoint(self, folder: Path, journal_offset: int) -> None:
         """A checkpoint is whole; rows up to the offset are covered by it."""
         ...
-
-
-class Pending(NamedTuple):
-    """A call under way: its kind, and what is needed to take its result."""
-
-    kind: str
-    worker_id: int
-    amount: int
 
 
 class TrainingLoop:
@@ -58,6 +57,7 @@ class TrainingLoop:
       checkpoints: folder of the run's checkpoints.
       observer: is told of rows and checkpoints.
       stop: asked once a round; True ends the run early, with a checkpoint.
+      recovery: decides about failed parts; remembers their failures in earlier attempts.
     """
 
     def __init__(
@@ -68,6 +68,7 @@ class TrainingLoop:
         checkpoints: Path,
         observer: Observer,
         stop: Callable[[], bool],
+        recovery: Recovery | None = None,
     ) -> None:
         self._config = config
         self._cluster = cluster
@@ -78,11 +79,10 @@ class TrainingLoop:
         self._stop = stop
         self._pacer = make_pacer(config, cluster.blocks_in_flight)
         self._meters = Meters()
-        self._pending: dict[Ref, Pending] = {}
-        self._collects = [0] * len(cluster.workers)
-        self._blocks_in_flight = 0
+        self._ledger = Ledger(len(cluster.workers), cluster.capacities(config))
+        self._under_way = UnderWay(len(cluster.workers), cluster.deadline_s, cluster.start_deadline_s)
+        self._mender = Mender(cluster, recovery or Recovery(), self._under_way, self._pacer, self._ledger, observer)
         self._weights: Ref = None
-        self._incarnation = 0
         self.env_steps = 0
         self.updates = 0
         self._saved_at: tuple[int, int] | None = None
@@ -97,6 +97,9 @@ class TrainingLoop:
 
         Raises:
           RuntimeError: nothing is under way and nothing may start.
+          RunLost: a part failed that only a checkpoint can bring back.
+          RunFailed: a part fails again and again.
+          PartFailed: a part failed before the first round.
         """
         if self._weights is None:
             self._send_first_weights()
@@ -108,7 +111,7 @@ class TrainingLoop:
             self._start_updates()  # sample, update, publish: when the pacer says so
             self._take_results()
             if self._is_due("log", self._config.log_every_env_steps):
-                self._write_row(self._meters.row(self._replay_size(), self._pacer.ratio()))
+                self._write_row(self._training_row())
             if self._is_due("checkpoint", self._config.checkpoint_every_env_steps):
                 self.checkpoint()
         if self._saved_at != (self.env_steps, self.updates):
@@ -116,30 +119,31 @@ class TrainingLoop:
         return self.env_steps >= self._config.total_env_steps
 
     def _send_first_weights(self) -> None:
-        self._weights = self._get(self._cluster.learner, "weights")[0]
-        for ref in [self._calls.start(worker, "set_weights", self._weights) for worker in self._cluster.workers]:
-            self._calls.get(ref)
+        self._weights = self._mender.ask(LEARNER, "weights")[0]
+        for worker in self._workers():
+            try:
+                self._mender.ask(worker, "set_weights", self._weights)
+            except PartFailed as failure:
+                self._mend(failure)
 
-    def _get(self, node: Any, method: str, *args: Any) -> Any:
-        return self._calls.get(self._calls.start(node, method, *args))
+    def _workers(self) -> list[Part]:
+        return [Part(PartKind.WORKER, worker_id) for worker_id in range(len(self._cluster.workers))]
 
     def _start_collects(self) -> None:
         config = self._config
         for _ in range(self._cluster.collects_in_flight):
-            for worker_id, worker in enumerate(self._cluster.workers):
-                if self._collects[worker_id] >= self._cluster.collects_in_flight:
+            for part in self._workers():
+                worker_id = part.number
+                if self._under_way.collects[worker_id] >= self._cluster.collects_in_flight:
                     continue
-                if not self._pacer.may_collect(self._blocks_in_flight):
+                if not self._pacer.may_collect(self._under_way.blocks_in_flight):
                     self._pacer.waited(to_insert=True)
                     return
                 rate = epsilon(config.epsilon_settings, self.env_steps, worker_id, config.workers)
-                self._add(self._calls.start(worker, "collect", rate), Pending("collect", worker_id, 0))
-                self._collects[worker_id] += 1
-                self._blocks_in_flight += 1
+                self._start(part, "collect", 0, rate)
 
     def _start_updates(self) -> None:
-        under_way = sum(pending.kind == "update" for pending in self._pending.values())
-        while under_way < self._cluster.updates_in_flight:
+        while self._under_way.count("update") < self._cluster.updates_in_flight:
             updates = self._pacer.updates_due()
             if not updates:
                 return
@@ -148,38 +152,66 @@ class TrainingLoop:
                 self._config.learning_rate_at(self.env_steps),
                 self._config.importance_exponent_at(self.env_steps),
             )
-            ref = self._calls.start(self._cluster.learner, "update", updates, rate, exponent)
-            self._add(ref, Pending("update", 0, updates))
-            under_way += 1
+            self._start(LEARNER, "update", updates, updates, rate, exponent)
 
     def _start_evaluation(self) -> None:
         seeds = list(range(EVAL_SEED, EVAL_SEED + self._config.eval_episodes))
         ref = self._calls.run(evaluate, self._config.env, self._weights, seeds)
-        self._add(ref, Pending("eval", 0, self.env_steps))
+        self._under_way.add(ref, Pending("eval", EVALUATOR, self._mender.incarnation(EVALUATOR), self.env_steps))
 
-    def _add(self, ref: Ref, pending: Pending) -> None:
-        self._pending[ref] = pending
+    def _start(self, part: Part, method: str, amount: int, *args: Any) -> None:
+        ref = self._calls.start(self._mender.node(part), method, *args)
+        self._under_way.add(ref, Pending(method, part, self._mender.incarnation(part), amount))
 
     def _take_results(self) -> None:
-        if not self._pending:
+        if not self._under_way:
             raise RuntimeError("nothing is under way and pacing lets nothing start")
-        for ref in self._calls.wait(list(self._pending)):
-            pending = self._pending.pop(ref)
-            result = self._calls.get(ref)
-            if pending.kind == "collect":
-                self._collects[pending.worker_id] -= 1
-                self._take_blocks(result)
-            elif pending.kind == "update":
-                self._take_updates(result, pending.amount)
+        ready = self._calls.wait(self._under_way.refs, self._under_way.patience_s())
+        late = self._under_way.late(ready)
+        for ref in ready:
+            pending = self._under_way.take(ref)
+            if pending is None:
+                continue  # its part was replaced a moment ago
+            try:
+                result = self._calls.get(ref)
+            except CallFailed as error:
+                self._take_failure(pending, pending.failed(error))
+            except PartFailed as failure:  # of a part that the called one needs
+                self._take_failure(pending, failure)
             else:
-                self._take_evaluation(result, pending.amount)
+                self._take_result(pending, result)
+        for failed in late:
+            self._mend(failed)
+
+    def _take_result(self, pending: Pending, result: Any) -> None:
+        self._mender.worked(pending.part)
+        if pending.kind == "collect":
+            self._take_blocks(result)
+        elif pending.kind == "update":
+            self._take_updates(result, pending.amount)
+        else:
+            self._take_evaluation(result, pending.amount)
+
+    def _take_failure(self, pending: Pending, failure: PartFailed) -> None:
+        if pending.kind == "update":
+            self._pacer.not_sampled(pending.amount)
+        self._mend(failure)
+
+    def _mend(self, failure: PartFailed) -> None:
+        unreported = self._mender.mend(failure, self._weights)
+        self.env_steps += unreported.env_steps
+        if failure.part == EVALUATOR:
+            self._start_evaluation()
 
     def _take_blocks(self, reports: list[BlockReport]) -> None:
         for report in reports:
-            self._blocks_in_flight -= 1
-            self._pacer.inserted(report.stored)
+            self._under_way.blocks[report.header.worker_id] -= 1
+            self._pacer.inserted(self._ledger.take(report))
             self._meters.take_block(report)
             self.env_steps += report.header.env_steps
+            failure = self._mender.check_push(report)
+            if failure is not None:
+                self._mend(failure)
 
     def _take_updates(self, report: UpdateReport, updates: int) -> None:
         self._meters.take_updates(report, updates)
@@ -195,8 +227,10 @@ class TrainingLoop:
         self._journal.append(row)
         self._observer.row(row)
 
-    def _replay_size(self) -> int:
-        return min(self._pacer.state.inserted, self._config.replay_capacity)
+    def _training_row(self) -> dict[str, float]:
+        row = self._meters.row(self._ledger.replay_size, self._pacer.ratio()) | self._ledger.row()
+        counts = {"sampled": self._pacer.state.sampled, "updates": self.updates, "restarts": self._mender.restarts}
+        return row | {f"account/{name}": float(count) for name, count in counts.items()}
 
     def _is_due(self, what: str, every: int) -> bool:
         """Whether `env_steps` has passed the next multiple of `every`; moves on to the one after."""
@@ -207,13 +241,23 @@ class TrainingLoop:
 
     def settle(self) -> None:
         """Waits until nothing is under way anywhere."""
-        while self._pending:
+        while self._under_way:
             self._take_results()
-        for worker in self._cluster.workers:
-            self._take_blocks(self._get(worker, "settle"))
+        for worker in self._workers():
+            try:
+                self._take_blocks(self._mender.ask(worker, "settle"))
+            except PartFailed as failure:
+                self._mend(failure)  # a new worker has nothing under way
 
     def checkpoint(self) -> Path:
         """Writes a checkpoint of the whole run at a moment when nothing is under way."""
+        while True:
+            try:
+                return self._checkpoint()
+            except PartFailed as failure:
+                self._mend(failure)
+
+    def _checkpoint(self) -> Path:
         self.settle()
         offset = self._journal.sync()
         folder = write_checkpoint(self._checkpoints, self.env_steps, lambda part: self._save(part, offset))
@@ -223,18 +267,19 @@ class TrainingLoop:
         return folder
 
     def _save(self, folder: Path, journal_offset: int) -> dict[str, Any]:
-        learner = self._get(self._cluster.learner, "save", folder)
+        learner = self._mender.ask(LEARNER, "save", folder)
         workers = [
-            self._get(worker, "save", folder / f"worker-{i}.safetensors")
-            for i, worker in enumerate(self._cluster.workers)
+            self._mender.ask(worker, "save", folder / f"worker-{worker.number}.safetensors")
+            for worker in self._workers()
         ]
         return {
             "config_hash": config_hash(self._config),
             "env_steps": self.env_steps,
             "updates": self.updates,
-            "incarnation": self._incarnation,
+            "incarnation": self._mender.highest,
             "pacing": self._pacer.state._asdict(),
             "meters": self._meters.get_state(),
+            "ledger": self._ledger.get_state(),
             "due": self._due,
             "journal_offset": journal_offset,
             "learner": learner,
@@ -248,22 +293,42 @@ class TrainingLoop:
           ValueError: its files do not fit this run.
         """
         folder, state = checkpoint
-        self._weights = self._get(self._cluster.learner, "load", folder, state["learner"])[0]
-        for i, worker in enumerate(self._cluster.workers):
-            self._get(worker, "load", folder / f"worker-{i}.safetensors", state["workers"][i])
+        self._weights = self._mender.ask(LEARNER, "load", folder, state["learner"])[0]
+        for worker in self._workers():
+            i = worker.number
+            self._mender.ask(worker, "load", folder / f"worker-{i}.safetensors", state["workers"][i])
         self.env_steps, self.updates = state["env_steps"], state["updates"]
-        self._incarnation = state["incarnation"] + 1
         self._pacer.state = PacingState(**state["pacing"])
         self._meters.set_state(state["meters"])
+        self._ledger.set_state(state["ledger"])
         self._due = dict(state["due"])
 
-    def final_evaluation(self) -> EpisodeStats:
-        """Plays the newest weights over `final_eval_episodes`, in parallel tasks."""
+    def lost(self, failure: PartFailed) -> RunLost:
+        """Ends this attempt because of a failure outside of the rounds of training (see `run` for other errors)."""
+        try:
+            self._mender.decide(failure)
+        except RunLost as lost:
+            return lost
+        return RunLost(failure, self._mender.highest)
+
+    def final_evaluation(self, weights: WeightsSnapshot) -> EpisodeStats:
+        """Plays `weights` over `final_eval_episodes`, in parallel tasks that need none of the run's parts."""
         first = self._config.final_eval_first_seed
         seeds = list(range(first, first + self._config.final_eval_episodes))
-        return evaluate_in_parts(self._calls, self._config.env, self._weights, seeds, self._cluster.eval_tasks)
+        shared = self._calls.put(weights)
+        try:
+            return evaluate_in_parts(self._calls, self._config.env, shared, seeds, self._cluster.eval_tasks)
+        except CallFailed as failure:
+            raise RunFailed(f"the evaluation at the end {failure.fault} again and again: {failure.reason}") from failure
 
     def newest_weights(self) -> WeightsSnapshot:
-        """The weights that `final_evaluation` plays."""
-        weights: WeightsSnapshot = self._calls.get(self._weights)
+        """The weights that the last update made.
+
+        Raises:
+          PartFailed: they are gone with the learner.
+        """
+        try:
+            weights: WeightsSnapshot = self._calls.get(self._weights)
+        except CallFailed as failure:
+            raise PartFailed(LEARNER, self._mender.incarnation(LEARNER), failure.fault, failure.reason) from failure
         return weights

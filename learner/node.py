@@ -13,8 +13,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from actors.calls import Calls, Node, Ref
+from actors.faults import CallFailed, Part, PartFailed, PartKind
 from actors.nodes import ShardNode
-from actors.transitions import AddReply, Draws, SampleReply, TransitionBlock
+from actors.transitions import AddReply, Delivered, Draws, SampleReply, TransitionBlock
 from learner.double_dqn import importance_weights
 from learner.learner import Learner, LearnerSettings, UpdateStats
 
@@ -53,7 +54,8 @@ class LearnerNode:
         torch.set_num_threads(1)
         self._settings = settings
         self._learner = Learner(settings)
-        self._shards = shards
+        self._shards = list(shards)
+        self._shard_incarnations = [0] * len(shards)
         self._shard_calls = shard_calls
         self._calls = calls
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence((settings.seed, 1))))
@@ -66,6 +68,31 @@ class LearnerNode:
         """Stores a block in an embedded shard, each in turn."""
         shard: ShardNode = self._shards[block.header.sequence % len(self._shards)]
         return shard.add(block)
+
+    def fence(self, worker_id: int, closed: int, incarnation: int) -> Delivered:
+        """Fences a worker in all embedded shards (see `ShardNode.fence`); returns what they hold together."""
+        parts: list[Delivered] = [shard.fence(worker_id, closed, incarnation) for shard in self._shards]
+        rows, env_steps, episodes, made = zip(*parts, strict=True)
+        return Delivered(sum(rows), sum(env_steps), sum(episodes), max(made))
+
+    def replace_shard(self, index: int, shard: Node, incarnation: int) -> None:
+        """Samples from `shard`, which is empty, in the place of the shard of this index."""
+        self._shards[index], self._shard_incarnations[index] = shard, incarnation
+        self._masses[index] = 0.0
+        self._answers.pop(index, None)
+        self._shard_calls.start(shard, "publish", self._learner.updates, [self._weights])
+
+    def _result(self, index: int, ref: Ref) -> Any:
+        """What a call of the shard of this index gave.
+
+        Raises:
+          PartFailed: the shard failed; nothing has been learned meanwhile.
+        """
+        try:
+            return self._shard_calls.get(ref)
+        except CallFailed as failure:
+            part = Part(PartKind.SHARD, index)
+            raise PartFailed(part, self._shard_incarnations[index], failure.fault, failure.reason) from failure
 
     def update(self, updates: int, learning_rate: float, importance_exponent: float = 1.0) -> UpdateReport:
         """Samples a super-batch, makes `updates` updates of it, and publishes the weights.
@@ -96,7 +123,7 @@ class LearnerNode:
         """Draws rows from the shards in proportion to their masses, in random order."""
         self._take_answers()
         if len(self._shards) == 1:
-            reply: SampleReply = self._shard_calls.get(self._shard_calls.start(self._shards[0], "sample", count))
+            reply: SampleReply = self._result(0, self._shard_calls.start(self._shards[0], "sample", count))
             return Sample(reply.rows, None, reply.draws)
         if not self._masses.all():
             self._masses[:] = self._ask_all("mass")
@@ -104,7 +131,7 @@ class LearnerNode:
         shares = self._rng.multinomial(count, chances)
         asked = np.flatnonzero(shares)  # a shard may still be empty
         refs = [self._shard_calls.start(self._shards[i], "sample", int(shares[i])) for i in asked]
-        replies = [self._shard_calls.get(ref) for ref in refs]
+        replies = [self._result(i, ref) for i, ref in zip(asked.tolist(), refs, strict=True)]
         self._masses[asked] = [reply.mass for reply in replies]
         order = self._rng.permutation(count)
         rows = np.concatenate([reply.rows for reply in replies])[order]
@@ -127,11 +154,11 @@ class LearnerNode:
         """Waits until the shards have taken the last call's TD errors, which may have failed there."""
         while self._answers:
             i, ref = self._answers.popitem()
-            self._masses[i] = self._shard_calls.get(ref)
+            self._masses[i] = self._result(i, ref)
 
     def _ask_all(self, method: str) -> list[Any]:
         refs = [self._shard_calls.start(shard, method) for shard in self._shards]
-        return [self._shard_calls.get(ref) for ref in refs]
+        return [self._result(i, ref) for i, ref in enumerate(refs)]
 
     def save(self, folder: Path) -> dict[str, Any]:
         """Writes learner and shards into `folder`; returns the rest of their state, for JSON."""
@@ -140,7 +167,7 @@ class LearnerNode:
         refs = [
             self._shard_calls.start(shard, "save", folder / f"shard-{i}.zarr") for i, shard in enumerate(self._shards)
         ]
-        shards = [self._shard_calls.get(ref) for ref in refs]
+        shards = [self._result(i, ref) for i, ref in enumerate(refs)]
         return {"shards": shards, "rng": self._rng.bit_generator.state, "sizes": self._masses.tolist()}
 
     def load(self, folder: Path, state: dict[str, Any]) -> list[Ref]:
@@ -159,8 +186,8 @@ class LearnerNode:
             self._shard_calls.start(shard, "load", folder / f"shard-{i}.zarr", shard_state)
             for i, (shard, shard_state) in enumerate(zip(self._shards, state["shards"], strict=True))
         ]
-        for ref in refs:
-            self._shard_calls.get(ref)
+        for i, ref in enumerate(refs):
+            self._result(i, ref)
         self._rng.bit_generator.state = state["rng"]
         self._answers.clear()
         self._masses[:] = state["sizes"]

@@ -15,12 +15,13 @@ from learner.config import RunConfig
 
 
 class PacingState(NamedTuple):
-    """Counters that a checkpoint holds."""
+    """Counters that a checkpoint holds; `written_off` are samples that lost transitions will not give."""
 
     inserted: int
     sampled: int
     waits_to_insert: int
     waits_to_sample: int
+    written_off: float = 0.0
 
 
 class Pacer:
@@ -63,16 +64,18 @@ class Pacer:
 
     def may_collect(self, blocks_in_flight: int) -> bool:
         """Whether one more block may be started while `blocks_in_flight` are under way."""
-        expected = self.state.inserted + (blocks_in_flight + 1) * self._block_rows
-        return expected * self._samples_per_insert - self.state.sampled <= self._highest
+        return self._ahead((blocks_in_flight + 1) * self._block_rows) <= self._highest
+
+    def _ahead(self, expected: int = 0) -> float:
+        """Samples that the transitions inserted, and `expected` ones, have still to give."""
+        inserted, sampled = self.state.inserted + expected, self.state.sampled
+        return inserted * self._samples_per_insert - sampled - self.state.written_off
 
     def updates_due(self) -> int:
         """Updates to start now: `updates_per_call` once the replay is ahead by as many, else 0."""
-        inserted, sampled = self.state.inserted, self.state.sampled
-        if inserted < self._min_replay:
+        if self.state.inserted < self._min_replay:
             return 0
-        ahead = inserted * self._samples_per_insert - sampled
-        return self._updates_per_call if ahead >= self._lowest else 0
+        return self._updates_per_call if self._ahead() >= self._lowest else 0
 
     def inserted(self, rows: int) -> None:
         """Counts stored transitions."""
@@ -81,6 +84,19 @@ class Pacer:
     def sampling(self, updates: int) -> None:
         """Counts the samples of updates that are being started."""
         self.state = self.state._replace(sampled=self.state.sampled + updates * self._batch_size)
+
+    def not_sampled(self, updates: int) -> None:
+        """Takes back the samples of updates that could not be made."""
+        self.state = self.state._replace(sampled=self.state.sampled - updates * self._batch_size)
+
+    def lost(self, share: float) -> None:
+        """Writes off what a lost share of the replay had still to give, as if it had never been inserted.
+
+        After the loss of all of it, `min_replay` transitions must come before the next update, as at the start; to
+        sample new ones in the place of lost ones would break their ratio.
+        """
+        written_off = self.state.written_off + share * max(0.0, self._ahead())
+        self.state = self.state._replace(written_off=written_off)
 
     def waited(self, to_insert: bool) -> None:
         """Counts a moment when only one side could go on; `to_insert` if it was the collecting that waited."""

@@ -13,15 +13,29 @@ from typing import Any
 
 import ray
 from ray.actor import ActorHandle
+from ray.exceptions import (
+    ActorUnavailableError,
+    GetTimeoutError,
+    NodeDiedError,
+    ObjectLostError,
+    OutOfMemoryError,
+    RayActorError,
+    RayError,
+    RayTaskError,
+    TaskCancelledError,
+    WorkerCrashedError,
+)
 
 from actors.calls import LocalCalls, Node, Ref
 from actors.evaluator import Candidate, evaluate_in_parts
+from actors.faults import CallFailed, Fault, PartFailed
 from actors.nodes import RolloutNode, ShardNode
 from actors.transitions import EpisodeStats
 from actors.vector_env import EnvSpec, env_shape
 from learner.cluster import Cluster, learner_settings, rollout_settings, shard_settings
 from learner.config import RunConfig
 from learner.node import LearnerNode
+from learner.place import DEADLINE_S, Place
 from sim_core.checks import ConfigError, require
 
 PUSHES_IN_FLIGHT = 1
@@ -30,18 +44,49 @@ COLLECTS_IN_FLIGHT = 2
 """Collects of a worker that are started ahead, so that it never waits for the driver."""
 UPDATES_IN_FLIGHT = 2
 """Calls of updates that are started ahead, so that the learner never waits for the driver."""
-DEADLINE_S = 300.0
-"""A call that has not ended by then means that a part of the service hangs."""
+INNER_SHARE = 0.5
+"""Share of the deadline that parts give each other, so that one that waits is not itself late."""
+FAULTS: tuple[tuple[tuple[type[Exception], ...], Fault], ...] = (
+    ((ActorUnavailableError,), Fault.UNREACHABLE),
+    ((RayActorError, WorkerCrashedError, NodeDiedError, OutOfMemoryError, TaskCancelledError), Fault.DIED),
+    ((ObjectLostError,), Fault.OBJECT_LOST),
+    ((GetTimeoutError,), Fault.LATE),
+)
+"""What errors of Ray mean; the first match counts."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
 @lru_cache
 def _task(function: Callable[..., Any]) -> Any:
-    return ray.remote(num_cpus=0)(function)
+    return ray.remote(num_cpus=0, max_retries=0)(function)
+
+
+def _as_fault(error: Exception) -> Exception:
+    """What an error of Ray means; what our own code raised stays as it is."""
+    if isinstance(error, RayTaskError):
+        cause = getattr(error, "cause", None)
+        if isinstance(cause, CallFailed | PartFailed):
+            return cause
+        return _as_fault(cause) if isinstance(cause, RayError) else error
+    for kinds, fault in FAULTS:
+        if isinstance(error, kinds):
+            return CallFailed(fault, _first_line(error))
+    return error
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 class RayCalls:
-    """Calls of Ray actors; implements `actors.calls.Calls`."""
+    """Calls of Ray actors; implements `actors.calls.Calls`.
+
+    Args:
+      deadline_s: `get` waits no longer.
+    """
+
+    def __init__(self, deadline_s: float) -> None:
+        self._deadline_s = deadline_s
 
     def start(self, node: Node, method: str, *args: Any) -> Ref:
         """Starts an actor's method."""
@@ -51,41 +96,47 @@ class RayCalls:
         """Starts a function as a Ray task; it takes no CPU slot, so that it never waits for the run's own actors."""
         return _task(function).remote(*args)
 
-    def wait(self, refs: list[Ref]) -> list[Ref]:
-        """Blocks until one of `refs` is there; returns all that are, in the given order.
-
-        Raises:
-          TimeoutError: none was there within the deadline.
-        """
-        ready, _ = ray.wait(refs, num_returns=1, timeout=DEADLINE_S, fetch_local=False)
-        if not ready:
-            raise TimeoutError(f"none of {len(refs)} calls under way ended within {DEADLINE_S:.0f} s")
+    def wait(self, refs: list[Ref], timeout_s: float) -> list[Ref]:
+        """Blocks until one of `refs` is there or the time is over; returns all that are, in the given order."""
+        ray.wait(refs, num_returns=1, timeout=timeout_s, fetch_local=False)
         ready, _ = ray.wait(refs, num_returns=len(refs), timeout=0, fetch_local=False)
         return [ref for ref in refs if ref in set(ready)]
 
     def get(self, ref: Ref) -> Any:
-        """The result behind `ref`."""
-        return ray.get(ref, timeout=DEADLINE_S)
+        """The result behind `ref`.
+
+        Raises:
+          CallFailed: the call could not be made, its result is gone, or the deadline passed.
+        """
+        try:
+            return ray.get(ref, timeout=self._deadline_s)
+        except GetTimeoutError as error:
+            raise CallFailed(Fault.LATE, f"no answer within {self._deadline_s:.0f} s") from error
+        except RayError as error:
+            fault = _as_fault(error)
+            if fault is error:
+                raise
+            raise fault from error
 
     def put(self, value: Any) -> Ref:
         """Puts a value into the object store."""
         return ray.put(value)
 
 
-def _make_learner(config: RunConfig, shards: list[Node]) -> LearnerNode:
+def _make_learner(config: RunConfig, shards: list[Node], calls: RayCalls) -> LearnerNode:
     """Builds the learner in its actor; without shard actors, its shards too."""
     shape = env_shape(config.env)
     if shards:
-        return LearnerNode(learner_settings(config, shape), shards, RayCalls(), RayCalls())
+        return LearnerNode(learner_settings(config, shape), shards, calls, calls)
     embedded: list[Node] = [ShardNode(settings) for settings in shard_settings(config, shape)]
-    return LearnerNode(learner_settings(config, shape), embedded, LocalCalls(), RayCalls())
+    return LearnerNode(learner_settings(config, shape), embedded, LocalCalls(), calls)
 
 
 class LearnerActor(LearnerNode):
     """LearnerNode built from the config, so that no large constructor argument breaks a restart."""
 
-    def __init__(self, config: RunConfig, shards: list[Node]) -> None:
-        self.__dict__ = _make_learner(config, shards).__dict__
+    def __init__(self, config: RunConfig, shards: list[Node], calls: RayCalls) -> None:
+        self.__dict__ = _make_learner(config, shards, calls).__dict__
 
 
 def cpus_needed(config: RunConfig) -> int:
@@ -119,7 +170,10 @@ def connect(cpus: int, address: str | None) -> None:
     Raises:
       ConfigError: the cluster cannot be reached or has too few CPUs.
     """
+    if ray.is_initialized():
+        return  # an earlier attempt of this run has joined
     os.environ.setdefault("RAY_AUTH_MODE", "disabled" if address is None else "token")
+    os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # of calls to parts that have been replaced
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     options: dict[str, Any] = {"address": address}
     if address is None:
@@ -144,36 +198,66 @@ def evaluate_in_tasks(spec: EnvSpec, candidate: Candidate, seeds: list[int], add
       One entry a seed, in order.
     """
     connect(1, address)
-    calls = RayCalls()
+    calls = RayCalls(DEADLINE_S)
     try:
         return evaluate_in_parts(calls, spec, calls.put(candidate), seeds, cluster_cpus())
     finally:
         ray.shutdown()
 
 
-def ray_cluster(config: RunConfig, incarnation: int, address: str | None) -> Cluster:
+def ray_cluster(config: RunConfig, incarnation: int, place: Place) -> Cluster:
     """Places the run's parts as Ray actors (see `connect` for errors)."""
-    connect(cpus_needed(config), address)
-    calls = RayCalls()
+    connect(cpus_needed(config), place.address)
+    inner = RayCalls(place.deadline_s * INNER_SHARE)
     shape = env_shape(config.env)
-    shards: list[Node] = []
-    if config.replay_placement == "actors":
-        shards = [ray.remote(num_cpus=1)(ShardNode).remote(settings) for settings in shard_settings(config, shape)]
-    learner = ray.remote(num_cpus=1, num_gpus=learner_gpus(config))(LearnerActor).remote(config, shards)
-    targets: list[ActorHandle] = shards or [learner]
-    workers: list[Node] = [
-        ray.remote(num_cpus=1)(RolloutNode).remote(
-            rollout_settings(config), worker_id, incarnation, calls, targets, PUSHES_IN_FLIGHT
-        )
-        for worker_id in range(config.workers)
-    ]
+    own = config.replay_placement == "actors"
+
+    def place_shard(index: int, incarnation: int) -> Node:
+        return _actor(ShardNode).remote(shard_settings(config, shape, incarnation)[index])
+
+    shards = [place_shard(index, 0) for index in range(config.replay_shards)] if own else []
+    learner = _actor(LearnerActor, learner_gpus(config)).remote(config, shards, inner)
+    targets = shards or [learner]
+
+    def place_worker(worker_id: int, incarnation: int) -> Node:
+        settings = rollout_settings(config)
+        return _actor(RolloutNode).remote(settings, worker_id, incarnation, inner, targets, PUSHES_IN_FLIGHT)
+
+    workers = [place_worker(worker_id, incarnation) for worker_id in range(config.workers)]
+
+    def abandon() -> None:
+        for node in {*targets, learner, *workers}:
+            _discard(node)
+
     return Cluster(
-        calls=calls,
+        calls=RayCalls(max(place.deadline_s, place.start_deadline_s)),
+        incarnation=incarnation,
         learner=learner,
         workers=workers,
+        targets=targets,
+        shards_are_parts=own,
+        place_worker=place_worker,
+        place_shard=place_shard,
+        discard=_discard,
+        deadline_s=place.deadline_s,
+        start_deadline_s=place.start_deadline_s,
         collects_in_flight=COLLECTS_IN_FLIGHT,
         blocks_in_flight=config.workers * (COLLECTS_IN_FLIGHT + PUSHES_IN_FLIGHT),
         updates_in_flight=UPDATES_IN_FLIGHT,
         eval_tasks=cluster_cpus(),
+        abandon=abandon,
         close=ray.shutdown,
     )
+
+
+def _actor(kind: type, gpus: int = 0) -> Any:
+    """`kind` as a Ray actor; no restarts by Ray itself, which would not know the incarnation."""
+    return ray.remote(num_cpus=1, num_gpus=gpus, max_restarts=0, max_task_retries=0)(kind)
+
+
+def _discard(what: Any) -> None:
+    """Ends an actor, or a call that nobody waits for any more. Ray kills a process that does not go by itself."""
+    if isinstance(what, ActorHandle):
+        ray.kill(what)
+    else:
+        ray.cancel(what, force=True)

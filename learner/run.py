@@ -7,18 +7,26 @@ from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from actors.faults import Decision, Mended, PartFailed, Recovery
 from actors.network import WeightsSnapshot
 from actors.transitions import EpisodeStats
 from learner.checkpoint import Checkpoint, CheckpointError, newest_valid
 from learner.cluster import Cluster, process_cluster
 from learner.config import RunConfig, config_hash
+from learner.delivery import Delivery, first_line, insist
+from learner.fault_log import FaultLog
 from learner.journal import Journal, PushedMark, Row
 from learner.loop import TrainingLoop
+from learner.mending import RunLost
+from learner.place import Place
 from learner.ray_edge import ray_cluster
 from learner.results import Evaluation, final_metrics, summarise
 from learner.run_folder import RunFolder
 from learner.stopping import stop_on_signals
-from learner.tracker import Tracker
+from learner.tracker import TROUBLE, Tracker
+
+LAST_FLUSH_S = 5.0
+"""How long a stopped run waits for MLflow; the next sitting delivers what it did not take."""
 
 
 class Display(Protocol):
@@ -45,44 +53,50 @@ class RunResult(NamedTuple):
 
 
 class MirroringObserver:
-    """Passes rows on to the display, and to MLflow once a checkpoint covers them.
+    """Passes rows on to the display, to MLflow once a checkpoint covers them, and faults to their log.
 
     Args:
-      tracker: the MLflow run.
-      journal: the run's journal.
-      pushed: remembers how much of it MLflow has.
-      display: shows rows to a person.
+      delivery: carries the journal to MLflow.
+      faults: the run's log of faults.
+      display: shows all to a person.
+      resumed: whether this process goes on with the run of another one.
     """
 
-    def __init__(self, tracker: Tracker, journal: Journal, pushed: PushedMark, display: Display) -> None:
-        self._tracker = tracker
-        self._journal = journal
-        self._pushed = pushed
+    def __init__(self, delivery: Delivery, faults: FaultLog, display: Display, resumed: bool) -> None:
+        self._delivery = delivery
+        self._faults = faults
         self._display = display
+        self._resumed = resumed
+
+    def ready(self) -> None:
+        """Logs that the run is where another process left it."""
+        if self._resumed:
+            self._faults.resumed()
 
     def row(self, row: Row) -> None:
         """Shows the row."""
         self._display.row(row)
 
     def checkpoint(self, folder: Path, journal_offset: int) -> None:
-        """Pushes the rows that the checkpoint covers; what fails is pushed with the next checkpoint."""
-        try:
-            self._tracker.push(self._journal.rows(self._pushed.read()))
-        except Exception as error:  # the client raises its own, requests' and SQLAlchemy's errors alike
-            self._display.message(f"MLflow did not take the metrics, they will be sent again: {_first_line(error)}")
-            return
-        self._pushed.write(journal_offset)
+        """Asks for the delivery of the rows that the checkpoint covers."""
+        self._delivery.up_to(journal_offset)
+
+    def failed(self, failure: PartFailed, decision: Decision) -> None:
+        """Logs and shows a failure."""
+        self._faults.failed(failure, decision)
+        self._display.message(f"{failure}: {decision.action}")
+
+    def mended(self, mended: Mended) -> None:
+        """Logs and shows that a part works again."""
+        self._faults.mended(mended)
+        self._display.message(f"{mended.part} works again after {mended.seconds:.1f} s")
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
-def open_cluster(config: RunConfig, incarnation: int, address: str | None) -> Cluster:
+def open_cluster(config: RunConfig, incarnation: int, place: Place) -> Cluster:
     """The run's parts under its engine."""
     if config.engine == "process":
         return process_cluster(config, incarnation)
-    return ray_cluster(config, incarnation, address)
+    return ray_cluster(config, incarnation, place)
 
 
 def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list[str]]:
@@ -106,41 +120,98 @@ def execute(
     tracker: Tracker,
     display: Display,
     checkpoint: Checkpoint | None,
-    address: str | None,
+    place: Place,
     finish: Callable[[RunResult, list[Row]], None],
 ) -> RunResult:
     """Trains from the start or from `checkpoint`, evaluates, and closes the MLflow run.
 
     Args:
-      folder: the run's folder.
+      folder: the run's folder, held if others may reach for it (`RunFolder.hold`).
       config: the run.
       tracker: its MLflow run, started or resumed.
       display: shows progress.
       checkpoint: where to go on, None for a fresh start.
-      address: Ray cluster, None for this machine.
+      place: where the parts go.
       finish: makes and logs the artifacts of a finished run from the result and all rows of metrics.
 
     Returns:
       How the run ended; the MLflow run is FINISHED, KILLED (stopped by a signal, resumable) or FAILED.
+
+    Raises:
+      RunFailed: a part of it fails again and again.
     """
-    state = checkpoint.state if checkpoint else {"incarnation": -1, "journal_offset": 0}
     status = "FAILED"
     try:
-        with closing(Journal(folder.journal, state["journal_offset"])) as journal:
-            cluster = open_cluster(config, state["incarnation"] + 1, address)
-            result = _train(folder, config, tracker, display, checkpoint, journal, cluster)
-            cluster.close()  # not after an error: references in its traceback must not outlive Ray, which ends at exit
-            if result.evaluation is not None:
-                rows = journal.rows()
-                tracker.final(final_metrics(result.evaluation), rows[-1].time_ms if rows else tracker.started_ms)
-                finish(result, rows)
+        result, rows = _train(folder, config, tracker, display, checkpoint, place)
+        if result.evaluation is not None:
+            patience_s = tracker.patience_s
+            time_ms = rows[-1].time_ms if rows else tracker.started_ms
+            metrics = final_metrics(result.evaluation)
+            insist(lambda: tracker.final(metrics, time_ms), "the results", patience_s, display.message)
+            insist(lambda: finish(result, rows), "the artifacts", patience_s, display.message)
         status = "FINISHED" if result.stopped_by is None else "KILLED"
         return result
     except KeyboardInterrupt:
         status = "KILLED"
         raise
     finally:
-        tracker.end(status)
+        _end(tracker, status, display)
+
+
+def _end(tracker: Tracker, status: str, display: Display) -> None:
+    """Closes the MLflow run; one that cannot be closed is so by the next sitting."""
+    patience_s = tracker.patience_s if status == "FINISHED" else 0.0
+    try:
+        insist(lambda: tracker.end(status), f"that the run is {status}", patience_s, display.message)
+    except TROUBLE as error:
+        display.message(f"MLflow does not know that the run is {status}: {first_line(error)}")
+
+
+def _train(
+    folder: RunFolder,
+    config: RunConfig,
+    tracker: Tracker,
+    display: Display,
+    checkpoint: Checkpoint | None,
+    place: Place,
+) -> tuple[RunResult, list[Row]]:
+    """Trains to the end, going back to the last checkpoint whenever a part is gone that only it can bring back."""
+    recovery, faults = Recovery(), FaultLog(folder.faults)
+    incarnation = checkpoint.state["incarnation"] + 1 if checkpoint else 0
+    resumed = checkpoint is not None
+    while True:
+        offset = checkpoint.state["journal_offset"] if checkpoint else 0
+        with closing(Journal(folder.journal, offset)) as journal:
+            cluster = open_cluster(config, incarnation, place)
+            delivery = Delivery(tracker, journal, PushedMark(folder.pushed, offset), display.message)
+            delivery.up_to(offset)
+            with closing(delivery):
+                observer = MirroringObserver(delivery, faults, display, resumed)
+                try:
+                    result = _attempt(folder, config, display, checkpoint, journal, cluster, observer, recovery)
+                except RunLost as lost:
+                    incarnation = lost.incarnation + 1
+                else:
+                    cluster.close()  # not after an error: references in its traceback must not outlive Ray
+                    _deliver_rest(delivery, tracker, result, display)
+                    return result, journal.rows()
+        cluster.abandon()
+        resumed = False
+        checkpoint = _last_checkpoint(folder, config)
+        display.message(f"going on from {checkpoint.folder if checkpoint else 'the start'}")
+
+
+def _last_checkpoint(folder: RunFolder, config: RunConfig) -> Checkpoint | None:
+    try:
+        return resume_point(folder, config)[0]
+    except CheckpointError:
+        return None  # lost before its first one
+
+
+def _deliver_rest(delivery: Delivery, tracker: Tracker, result: RunResult, display: Display) -> None:
+    left = delivery.flush(LAST_FLUSH_S if result.stopped_by is not None else max(LAST_FLUSH_S, tracker.patience_s))
+    if left is not None:
+        display.message(f"MLflow lacks the newest metrics, which `shoal resume` sends again: {left}")
 
 
 def _restore(loop: TrainingLoop, checkpoint: Checkpoint) -> None:
@@ -151,23 +222,33 @@ def _restore(loop: TrainingLoop, checkpoint: Checkpoint) -> None:
         raise CheckpointError(f"checkpoint {checkpoint.folder} does not fit this run: {cause}") from error
 
 
-def _train(
+def _attempt(
     folder: RunFolder,
     config: RunConfig,
-    tracker: Tracker,
     display: Display,
     checkpoint: Checkpoint | None,
     journal: Journal,
     cluster: Cluster,
+    observer: MirroringObserver,
+    recovery: Recovery,
 ) -> RunResult:
-    observer = MirroringObserver(tracker, journal, PushedMark(folder.pushed, journal.sync()), display)
+    """Trains with one set of parts.
+
+    Raises:
+      RunLost: a part is gone that only a checkpoint can bring back.
+    """
     with stop_on_signals() as stop:
-        loop = TrainingLoop(config, cluster, journal, folder.checkpoints, observer, stop)
-        if checkpoint is not None:
-            _restore(loop, checkpoint)
-        finished = loop.run()
-        if not finished:
-            return RunResult(loop.env_steps, loop.updates, stop.signal, None, None, None)
-        display.message(f"training done; evaluating {config.final_eval_episodes} greedy episodes")
-        episodes, weights = loop.final_evaluation(), loop.newest_weights()
+        loop = TrainingLoop(config, cluster, journal, folder.checkpoints, observer, stop, recovery)
+        try:
+            if checkpoint is not None:
+                _restore(loop, checkpoint)
+            observer.ready()
+            finished = loop.run()
+            if not finished:
+                return RunResult(loop.env_steps, loop.updates, stop.signal, None, None, None)
+            display.message(f"training done; evaluating {config.final_eval_episodes} greedy episodes")
+            weights = loop.newest_weights()
+            episodes = loop.final_evaluation(weights)
+        except PartFailed as failure:  # outside of the rounds of training
+            raise loop.lost(failure) from failure
         return RunResult(loop.env_steps, loop.updates, None, summarise(episodes), episodes, weights)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,9 +35,25 @@ class RunFolder:
         self.checkpoints = self.path / "checkpoints"
         self.journal = self.path / "metrics.jsonl"
         self.pushed = self.path / "metrics.pushed"
+        self.faults = self.path / "faults.jsonl"
         self.artifacts = self.path / "artifacts"
         self.policy = self.path / "policy.safetensors"
         self.results = self.path / "results.csv"
+
+    @contextmanager
+    def hold(self) -> Iterator[None]:
+        """Keeps every other process from training this run, until the end even if that is a kill.
+
+        Raises:
+          ConfigError: another process holds it.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        with (self.path / "lock").open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise ConfigError(f"another process is training {self.path}; wait for it or end it") from error
+            yield
 
     def save_config(self, config: RunConfig) -> None:
         """Writes `config.json`."""

@@ -27,14 +27,20 @@ from sim_core.checks import ConfigError
 
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "30")
 
 import mlflow  # noqa: E402
 import mlflow.pytorch  # noqa: E402
 from mlflow.entities import Metric, Param, RunTag  # noqa: E402
 from mlflow.exceptions import MlflowException  # noqa: E402
 from mlflow.models import infer_signature  # noqa: E402
+from requests import RequestException  # noqa: E402
 from sqlalchemy.exc import SQLAlchemyError  # noqa: E402
 
+TROUBLE = (MlflowException, SQLAlchemyError, RequestException)
+"""What MLflow's client raises when its store does not do what it should."""
+PATIENCE_S = 600.0
+"""How long a finished run waits for a server that does not answer."""
 MAX_BATCH = 900
 """Metrics of one request; MLflow takes at most 1,000."""
 CONNECT_TIMEOUT_S = 5.0
@@ -93,6 +99,11 @@ class Tracker:
             raise ConfigError(
                 f"the MLflow store {uri} cannot be opened ({first_line}); name another --tracking-uri"
             ) from error
+
+    @property
+    def patience_s(self) -> float:
+        """How long to try what the store does not take: a server may come back, a file does not."""
+        return PATIENCE_S if self.uri.startswith(("http:", "https:")) else 0.0
 
     def start(self, config: RunConfig, tags: dict[str, str] | None = None) -> None:
         """Creates the run, with the whole config as params and, with `tags`, what a user filters by as tags."""

@@ -24,6 +24,7 @@ from actors.vector_env import env_shape
 from learner.checkpoint import Checkpoint, CheckpointError
 from learner.config import RunConfig
 from learner.journal import Row
+from learner.place import Place
 from learner.policy_file import read_saved_policy, save_policy
 from learner.results import final_metrics, summarise
 from learner.run import RunResult, execute, resume_point
@@ -157,7 +158,7 @@ def _train(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker, 
         tracker.artifact(folder.policy)
         _log_table(results, folder, tracker)
 
-    execute(folder, cell.config, tracker, RowDisplay(on_row), _checkpoint(folder, cell.config), None, finish)
+    execute(folder, cell.config, tracker, RowDisplay(on_row), _checkpoint(folder, cell.config), Place(), finish)
 
 
 def _fixed_seeds(cell: Cell) -> list[int]:

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from actors.calls import Done, LocalCalls
+from actors.faults import CallFailed, Fault
 from actors.nodes import RolloutNode, ShardNode, ShardSettings
 from actors.rollout import RolloutSettings, RolloutWorker
-from actors.transitions import transition_dtype
+from actors.transitions import Delivered, Dropped, transition_dtype
 from actors.vector_env import env_shape
 
 NUM_ENVS, STEPS = 2, 8
@@ -153,7 +154,7 @@ def test_a_saved_node_goes_on_where_it_was(tmp_path, make_node, make_shard):
     resumed.load(tmp_path / "worker.safetensors", state)
     for report in expected:
         other = resumed.collect(0.5)[0]
-        assert other.header == report.header
+        assert other.header == report.header._replace(made=report.header.made - BLOCK)  # counted from the start
         for first, second in zip(other.episodes, report.episodes, strict=True):
             np.testing.assert_array_equal(first, second)
     assert [shard.size() // BLOCK for shard in again] == [1, 1]
@@ -175,3 +176,91 @@ def test_damaged_files_are_refused(tmp_path, make_node, make_shard):
     for damaged in (path, tmp_path / "missing.safetensors"):
         with pytest.raises(ValueError, match="cannot be read"):
             node.load(damaged, state)
+
+
+class Unreliable(LocalCalls):
+    """Calls of which the first ones fail as told: (fault, whether the call was made all the same)."""
+
+    def __init__(self, *faults):
+        self.faults = list(faults)
+
+    def start(self, node, method, *args):
+        fault, made = self.faults.pop(0) if method == "add" and self.faults else (None, True)
+        result = super().start(node, method, *args) if made else None
+        return (fault, result)
+
+    def get(self, ref):
+        if isinstance(ref, Done):
+            return ref.value
+        fault, result = ref
+        if fault is not None:
+            raise CallFailed(fault, "simulated")
+        return result.value
+
+
+@pytest.mark.parametrize("made", [True, False])
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_push_that_is_tried_again_is_stored_and_reported_once(make_node, make_shard, made, times):
+    shard = make_shard()
+    node = make_node([shard], Unreliable(*[(Fault.UNREACHABLE, made)] * times))
+    (report,) = node.collect(0.5)
+    assert (report.stored, report.rows, report.dropped, report.fault) == (BLOCK, BLOCK, None, None)
+    assert (shard.size(), shard.shard.dropped) == (BLOCK, times * BLOCK * made)
+
+
+@pytest.mark.parametrize("fault", [Fault.DIED, Fault.LATE])
+def test_a_block_whose_shard_is_gone_is_dropped_and_names_it(make_node, make_shard, fault):
+    shards = [make_shard(), make_shard()]
+    node = make_node(shards, Unreliable((fault, False)))
+    (report,) = node.collect(0.5)
+    assert (report.stored, report.rows, report.dropped, report.fault) == (0, BLOCK, Dropped.SHARD_LOST, fault)
+    assert (report.shard, report.shard_incarnation) == (0, 0)
+    node.replace_shard(0, make_shard(), 7)
+    reports = [node.collect(0.5)[0] for _ in range(2)]
+    assert [(report.stored, *report[6:8]) for report in reports] == [(BLOCK, 1, 0), (BLOCK, 0, 7)]
+    assert [report.header.made for report in reports] == [2 * BLOCK, 3 * BLOCK]
+
+
+def test_a_shard_that_stays_out_of_reach_is_given_up(make_node, make_shard):
+    node = make_node([make_shard()], Unreliable(*[(Fault.UNREACHABLE, False)] * 9))
+    (report,) = node.collect(0.5)
+    assert (report.dropped, report.fault) == (Dropped.SHARD_LOST, Fault.UNREACHABLE)
+
+
+def test_a_block_that_a_later_one_overtook_is_dropped_as_outdated(make_node, make_shard, settings, swarm, make_weights):
+    shard, worker = make_shard(), RolloutWorker(settings, 0, 0)
+    worker.set_weights(make_weights(swarm))
+    first, second = worker.collect(0.5), worker.collect(0.5)
+    assert not shard.add(second).duplicate
+    assert shard.add(second)[:2] == (0, True) and not shard.add(second).outdated
+    assert shard.add(first).outdated and shard.size() == BLOCK
+
+
+def test_a_fenced_worker_is_refused_and_its_deliveries_are_told(make_shard, settings, swarm, make_weights):
+    shard, workers = make_shard(), [RolloutWorker(settings, 0, incarnation) for incarnation in (0, 3)]
+    for worker in workers:
+        worker.set_weights(make_weights(swarm))
+    blocks = [workers[0].collect(0.5) for _ in range(3)]
+    for block in blocks[:2]:
+        shard.add(block)
+    episodes = sum(len(block.episodes.outcome) for block in blocks[:2])
+    for _ in range(2):  # to ask twice changes nothing
+        assert shard.fence(0, 0, 3) == (2 * BLOCK, 2 * BLOCK, episodes, 2 * BLOCK)
+    assert shard.add(blocks[2]).outdated and shard.size() == 2 * BLOCK
+    assert shard.fence(0, 3, 4) == Delivered()
+    assert shard.add(workers[1].collect(0.5)).outdated, "fenced before it delivered anything"
+    assert shard.fence(1, 0, 1) == Delivered(), "another worker"
+
+
+def test_lost_weights_leave_a_worker_with_those_it_has(make_node, make_shard, swarm, make_weights):
+    shard = make_shard()
+    node = make_node([shard], Unreliable())
+    shard.publish(13, [(Fault.OBJECT_LOST, None)])
+    assert [node.collect(0.0)[0].header.policy_version for _ in range(2)] == [10, 10]
+    shard.publish(14, [Done(make_weights(swarm, version=14))])
+    assert [node.collect(0.0)[0].header.policy_version for _ in range(2)] == [10, 14]
+
+
+def test_a_worker_whose_weights_were_lost_on_their_way_says_so(settings, make_shard):
+    with pytest.raises(CallFailed, match="no weights"):
+        RolloutNode(settings, 0, 0, LocalCalls(), [make_shard()], 0).collect(0.5)

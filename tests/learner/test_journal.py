@@ -45,6 +45,7 @@ def test_offsets_are_the_files_length_and_mark_rows(path):
         assert offsets[-1] == path.stat().st_size
     for i, offset in enumerate(offsets):
         assert journal.rows(offset) == ROWS[i:]
+        assert journal.rows(0, offset) == ROWS[:i] and journal.rows(offsets[1], offset) == ROWS[1:i]
     journal.close()
     assert offsets[0] == 0 and len(path.read_text().splitlines()) == 5
 

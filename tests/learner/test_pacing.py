@@ -52,8 +52,11 @@ def start_all(pacer, setup, under_way, calls):
         under_way.append("update")
 
 
-def simulate(setup, calls, seed, events, short=True):
-    """Ends one random call under way at a time; the pacer after `events` of them."""
+def simulate(setup, calls, seed, events, short=True, loss=0.0):
+    """Ends one random call under way at a time; the pacer after `events` of them.
+
+    With probability `loss` an event also loses a random share of the replay, and updates then fail.
+    """
     pacer, rng, under_way = Pacer(*setup), random.Random(seed), []
     lowest, highest = band(setup)
     for _ in range(events):
@@ -62,11 +65,64 @@ def simulate(setup, calls, seed, events, short=True):
         kind = under_way.pop(rng.randrange(len(under_way)))
         if kind == "block":  # the first blocks hold fewer rows (n-step), a duplicate none
             pacer.inserted(rng.choice([setup.block_rows, setup.block_rows - 1, 0]) if short else setup.block_rows)
-        ahead = pacer.state.inserted * setup.samples_per_insert - pacer.state.sampled
-        assert ahead <= highest + 1e-6
-        assert ahead >= lowest - 1e-6 or not pacer.state.sampled
+        if rng.random() < loss:
+            before = pacer.state
+            pacer.lost(rng.choice([0.1, 0.5, 1.0]))
+            assert pacer.state.written_off >= before.written_off
+            if "update" in under_way:
+                under_way.remove("update")
+                pacer.not_sampled(setup.updates_per_call)
+        ahead = pacer.state.inserted * setup.samples_per_insert - pacer.state.sampled - pacer.state.written_off
+        assert ahead <= highest + (calls * setup.batch_size * setup.updates_per_call if loss else 0) + 1e-6
+        assert loss or ahead >= lowest - 1e-6 or not pacer.state.sampled
         assert not pacer.state.sampled or pacer.state.inserted >= setup.min_replay
     return pacer
+
+
+@given(setup=setups, calls=st.integers(1, 3), seed=st.integers(0, 999))
+@settings(max_examples=100, deadline=None)
+def test_losses_do_not_deadlock(setup, calls, seed):
+    simulate(setup, calls, seed, 300, loss=0.1)
+
+
+def test_after_the_loss_of_all_the_replay_fills_up_as_at_the_start():
+    pacer = Pacer(*Setup(2.0, 100, 10, 5, 20, 2))
+    for _ in range(9):
+        pacer.inserted(20)
+    while pacer.updates_due():
+        pacer.sampling(5)
+    pacer.lost(1.0)
+    held = 0
+    while not pacer.updates_due():
+        assert pacer.may_collect(0)
+        pacer.inserted(20)
+        held += 20
+    assert held == 100  # min_replay
+
+
+def test_new_transitions_are_sampled_as_often_whatever_was_lost():
+    """What is inserted after a loss gets samples_per_insert samples; what was lost is not made up for."""
+    pacer = Pacer(*Setup(2.0, 100, 10, 1, 20, 1))
+    lost_at = {40: 1.0, 80: 0.5}
+    sampled = {}
+    for i in range(2_000):
+        if i in lost_at:
+            pacer.lost(lost_at[i])
+        pacer.inserted(20)
+        while pacer.updates_due():
+            pacer.sampling(1)
+        sampled[i] = pacer.state.sampled
+    assert (sampled[1_999] - sampled[999]) / (1_000 * 20) == pytest.approx(2.0, rel=1e-3)
+    assert pacer.ratio() < 2.0
+
+
+def test_updates_that_could_not_be_made_are_taken_back():
+    pacer = Pacer(*Setup(4.0, 1, 8, 1, 8, 1))
+    pacer.inserted(8)
+    before = pacer.state
+    pacer.sampling(3)
+    pacer.not_sampled(3)
+    assert pacer.state == before
 
 
 @given(setup=setups, calls=st.integers(1, 3), seed=st.integers(0, 999))
@@ -125,7 +181,7 @@ def test_a_saved_state_decides_the_same(setup, seed):
     pacer.waited(to_insert=False)
     resumed = Pacer(*setup)
     resumed.state = PacingState(**pacer.state._asdict())
-    assert resumed.state == pacer.state and pacer.state[2:] == (1, 2)
+    assert resumed.state == pacer.state and pacer.state[2:4] == (1, 2)
     for _ in range(30):
         assert resumed.updates_due() == pacer.updates_due()
         assert [resumed.may_collect(i) for i in range(4)] == [pacer.may_collect(i) for i in range(4)]

@@ -1,5 +1,8 @@
 """A run's folder: its files, and the names that users give."""
 
+import subprocess
+import sys
+
 import pytest
 
 from learner.run_folder import RunFolder, RunIdentity, find_run
@@ -70,3 +73,15 @@ def test_an_unknown_run_is_refused_with_those_there_are(tmp_path, small_run):
         RunFolder(tmp_path / f"run-{i}").save_config(small_run)
     with pytest.raises(ConfigError, match="run-2, run-3, run-4, run-5, run-6$"):
         find_run("empty", tmp_path)
+
+
+def test_a_run_is_held_by_one_process_at_a_time(tmp_path):
+    path = tmp_path / "one"
+    other = "import sys, pathlib, learner.run_folder as r\nwith r.RunFolder(pathlib.Path(sys.argv[1])).hold(): pass"
+    with RunFolder(path).hold():
+        with pytest.raises(ConfigError, match="another process is training .*one"):
+            RunFolder(path).hold().__enter__()
+        done = subprocess.run([sys.executable, "-c", other, str(path)], capture_output=True, text=True, check=False)
+        assert done.returncode != 0 and "another process is training" in done.stderr
+    done = subprocess.run([sys.executable, "-c", other, str(path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,58 @@
+"""What must hold after a chaos run: accounts that balance, and every row of metrics in MLflow once."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import mlflow
+
+from learner.journal import Journal, Row
+from learner.run import resume_point
+from learner.run_folder import RunFolder
+
+
+def complaints(folder: RunFolder) -> list[str]:
+    """What is wrong with a run that has ended, a sentence each; nothing if all is well. Its MLflow server must run."""
+    config = folder.config()
+    state = resume_point(folder, config)[0].state
+    with closing(Journal(folder.journal, state["journal_offset"])) as journal:
+        rows = journal.rows()
+    wrong = []
+    ledger, pacing = state["ledger"], state["pacing"]
+    dropped = sum(ledger["dropped"].values())
+    if state["env_steps"] < config.total_env_steps:
+        wrong.append(f"the run has {state['env_steps']} env steps, not {config.total_env_steps}")
+    if ledger["produced"] != ledger["stored"] + dropped:
+        wrong.append(f"{ledger['produced']} transitions made are not {ledger['stored']} stored + {dropped} dropped")
+    if pacing["inserted"] != ledger["stored"]:
+        wrong.append(f"pacing counts {pacing['inserted']} transitions stored, the ledger {ledger['stored']}")
+    if pacing["sampled"] != state["updates"] * config.batch_size:
+        wrong.append(f"{pacing['sampled']} samples are not those of {state['updates']} updates")
+    return wrong + _unbalanced(rows) + _undelivered(folder, rows)
+
+
+def _unbalanced(rows: list[Row]) -> list[str]:
+    """Rows at which the accounts did not balance."""
+    accounts = [(row.env_steps, row.metrics) for row in rows if "account/produced" in row.metrics]
+    return [
+        f"at {env_steps} env steps the accounts do not balance"
+        for env_steps, metrics in accounts
+        if metrics["account/produced"] != metrics["account/stored"] + metrics["account/dropped"]
+    ]
+
+
+def _undelivered(folder: RunFolder, rows: list[Row]) -> list[str]:
+    """Metrics whose history in MLflow is not the journal's, in its order."""
+    identity = folder.identity()
+    client = mlflow.MlflowClient(identity.tracking_uri)
+    wrong = []
+    for key in sorted({key for row in rows for key in row.metrics}):
+        expected = sorted((row.time_ms, row.env_steps, row.metrics[key]) for row in rows if key in row.metrics)
+        history = client.get_metric_history(identity.mlflow_run_id, key)
+        found = sorted((metric.timestamp, metric.step, metric.value) for metric in history)
+        if found != expected:
+            wrong.append(f"MLflow has {len(found)} values of {key}, the journal {len(expected)}, or others")
+    status = client.get_run(identity.mlflow_run_id).info.status
+    if status != "FINISHED":
+        wrong.append(f"MLflow says that the run is {status}")
+    return wrong

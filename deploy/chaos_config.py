@@ -1,0 +1,40 @@
+"""The run that `shoal chaos` attacks: small, with two of everything that can be lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+NAME = "run"
+CONFIG = "chaos.toml"
+
+_TEXT = """\
+total_env_steps = {env_steps}
+workers = 2
+envs_per_worker = 8
+steps_per_block = 16
+replay_shards = 2
+replay_placement = "actors"
+replay_capacity = 20000
+min_replay = 1024
+samples_per_insert = 1.0
+batch_size = 32
+updates_per_call = 4
+hidden_sizes = [32]
+n_step = 2
+target_update_interval = 50
+eval_every_env_steps = 4000
+eval_episodes = 50
+final_eval_episodes = 100
+log_every_env_steps = 2000
+checkpoint_every_env_steps = 8000
+
+[world]
+robots = 3
+groups = 2
+horizon_steps = 100
+"""
+
+
+def write_config(path: Path, env_steps: int) -> None:
+    """Writes the run's settings for `shoal train --config`."""
+    path.write_text(_TEXT.format(env_steps=env_steps))

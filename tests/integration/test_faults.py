@@ -1,0 +1,72 @@
+"""Faults from outside: an MLflow server that goes away and comes back, and a run under a schedule of kills."""
+
+import dataclasses
+import time
+
+import pytest
+
+from deploy.chaos_checks import complaints
+from deploy.chaos_processes import TrackingServer
+from learner.journal import PushedMark
+from learner.run_folder import RunFolder
+from tests.integration.conftest import SMALL, flags
+from tests.integration.jobs import Job
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:DeprecationWarning"),  # MLflow's own query
+]
+
+
+@pytest.fixture
+def server(tmp_path):
+    made = TrackingServer(tmp_path)
+    made.start()
+    made.wait()
+    yield made
+    made.kill()
+
+
+def wait_until(condition, job):
+    deadline_s = time.monotonic() + 200
+    while not condition():
+        assert time.monotonic() < deadline_s, job.log.read_text()
+        time.sleep(0.1)
+
+
+def test_metrics_of_an_outage_of_mlflow_arrive_later_and_once(server, tmp_path):
+    config = dataclasses.replace(SMALL, total_env_steps=30_000)
+    job = Job(tmp_path, "train", "--name", "r", "--tracking-uri", server.uri, *flags(config))
+    folder = RunFolder(tmp_path / "runs" / "r")
+    try:
+        wait_until(lambda: PushedMark.value(folder.pushed) > 0, job)
+        server.kill()
+        delivered = PushedMark.value(folder.pushed)
+        wait_until(lambda: "training done" in job.log.read_text(), job)  # nobody waited for the server
+        assert PushedMark.value(folder.pushed) == delivered < folder.journal.stat().st_size
+        server.start()
+        assert job.process.wait(200) == 0, job.log.read_text()
+    finally:
+        if job.process.poll() is None:
+            job.process.kill()
+            job.process.wait()
+    output = job.log.read_text()
+    assert "MLflow does not take the metrics, they are kept and sent again" in output
+    assert "MLflow takes the metrics again; none is missing" in output
+    assert "Traceback" not in output
+    assert complaints(folder) == []
+
+
+@pytest.mark.ray
+@pytest.mark.timeout(900)
+def test_a_run_reaches_its_target_whatever_is_killed(shoal):
+    schedule = ("--env-steps", "24000", "--faults", "6", "--every-s", "3", "--seed", "1")
+    done = shoal("chaos", "--out", "chaos", *schedule, timeout_s=880)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "6 faults; target reached, accounts balance, MLflow has every row once" in done.stdout
+
+
+def test_a_used_folder_is_refused(shoal, tmp_path):
+    (tmp_path / "chaos" / "run").mkdir(parents=True)
+    done = shoal("chaos", "--out", "chaos")
+    assert done.returncode == 2 and "name another --out" in done.stderr
