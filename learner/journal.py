@@ -13,6 +13,9 @@ from typing import NamedTuple
 
 from sim_core.checks import ConfigError
 
+TOTAL = "total/"
+"""Begins the names of counters since the run's start, which are for monitoring: MLflow's charts want few keys."""
+
 
 class Row(NamedTuple):
     """Metrics of one moment: env steps, wall time in milliseconds, values by name."""

@@ -8,6 +8,7 @@ from typing import Any
 import psutil
 
 from actors.transitions import NO_OUTCOME, BlockReport
+from learner.journal import TOTAL
 from learner.node import UpdateReport
 from sim_core.outcomes import Outcome
 
@@ -18,6 +19,7 @@ class Meters:
     def __init__(self) -> None:
         self._sums: dict[str, float] = {}
         self._epsilon = 0.0
+        self._episodes = 0
         self._start_s = time.perf_counter()
         self._measured = {"env_steps": 0.0, "updates": 0.0}
 
@@ -33,6 +35,7 @@ class Meters:
         """Counts a stored block."""
         self._epsilon = report.header.epsilon
         episodes = report.episodes
+        self._episodes += len(episodes.outcome)
         self._add(blocks=1, staleness_updates=report.staleness_updates, staleness_s=report.staleness_s)
         self._add(
             episodes=len(episodes.outcome),
@@ -53,6 +56,7 @@ class Meters:
         """The metrics since the last row; starts the next."""
         metrics = {"train/epsilon": self._epsilon, "replay/size": float(replay_size)}
         metrics["replay/samples_per_insert"] = samples_per_insert
+        metrics[f"{TOTAL}episodes"] = self._episodes
         metrics |= self._means("train/", "episodes", {"return": "episode_return", "episode_length": "episode_length"})
         metrics |= self._means("train/", "named", {"success_rate": "successes"})
         metrics |= self._means("train/", "calls", {"loss": "loss", "q_mean": "q_mean", "td_error": "td_error"})
@@ -78,8 +82,9 @@ class Meters:
 
     def get_state(self) -> dict[str, Any]:
         """The sums, for JSON; clocks start anew on resume."""
-        return {"sums": dict(self._sums), "epsilon": self._epsilon}
+        return {"sums": dict(self._sums), "epsilon": self._epsilon, "episodes": self._episodes}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Takes up what `get_state` gave."""
+        """Takes up what `get_state` gave; a checkpoint from before episodes were counted starts them at 0."""
         self._sums, self._epsilon = dict(state["sums"]), state["epsilon"]
+        self._episodes = state.get("episodes", 0)

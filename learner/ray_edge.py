@@ -13,6 +13,7 @@ from typing import Any
 
 import ray
 from ray.actor import ActorHandle
+from ray.exceptions import AuthenticationError
 
 from actors.calls import LocalCalls, Node, Ref
 from actors.evaluator import Candidate, evaluate_in_parts
@@ -103,7 +104,7 @@ def connect(cpus: int, address: str | None) -> None:
     """Joins the cluster at `address`, or starts Ray on this machine with room for `cpus` CPU slots.
 
     Raises:
-      ConfigError: the cluster cannot be reached or has too few CPUs.
+      ConfigError: the cluster cannot be reached, wants another token, or has too few CPUs.
     """
     os.environ.setdefault("RAY_AUTH_MODE", "disabled" if address is None else "token")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
@@ -112,8 +113,11 @@ def connect(cpus: int, address: str | None) -> None:
         options = {"address": "local", "include_dashboard": False, "num_cpus": max(cpus, os.cpu_count() or 1)}
     try:
         ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
-    except ConnectionError as error:
-        raise ConfigError(f"no Ray cluster answers at {address!r}; start one with `ray start --head`") from error
+    except (ConnectionError, AuthenticationError) as error:
+        raise ConfigError(
+            f"no Ray cluster answers at {address!r} with this token; start one with `ray start --head`, and give this "
+            "process the cluster's token (RAY_AUTH_TOKEN, RAY_AUTH_TOKEN_PATH or ~/.ray/auth_token)"
+        ) from error
     have = cluster_cpus()
     if have < cpus:
         ray.shutdown()

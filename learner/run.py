@@ -16,6 +16,7 @@ from learner.config import RunConfig, config_hash
 from learner.journal import Journal, PushedMark, Row
 from learner.loop import TrainingLoop
 from learner.ray_edge import ray_cluster
+from learner.ray_metrics import RayMetrics
 from learner.results import Evaluation, final_metrics, summarise
 from learner.run_folder import RunFolder
 from learner.stopping import stop_on_signals
@@ -53,17 +54,27 @@ class MirroringObserver:
       journal: the run's journal.
       pushed: remembers how much of it MLflow has.
       display: shows rows to a person.
+      monitor: is given every row too.
     """
 
-    def __init__(self, tracker: Tracker, journal: Journal, pushed: PushedMark, display: Display) -> None:
+    def __init__(
+        self,
+        tracker: Tracker,
+        journal: Journal,
+        pushed: PushedMark,
+        display: Display,
+        monitor: Callable[[Row], None],
+    ) -> None:
         self._tracker = tracker
         self._journal = journal
         self._pushed = pushed
         self._display = display
+        self._monitor = monitor
 
     def row(self, row: Row) -> None:
         """Shows the row."""
         self._display.row(row)
+        self._monitor(row)
 
     def checkpoint(self, folder: Path, journal_offset: int) -> None:
         """Pushes the rows that the checkpoint covers; what fails is pushed with the next checkpoint."""
@@ -153,6 +164,11 @@ def _restore(loop: TrainingLoop, checkpoint: Checkpoint) -> None:
         raise CheckpointError(f"checkpoint {checkpoint.folder} does not fit this run: {cause}") from error
 
 
+def _monitor(folder: RunFolder, config: RunConfig) -> Callable[[Row], None]:
+    """Shows rows to Prometheus where this process has joined a Ray."""
+    return RayMetrics(folder.path.name).row if config.engine == "ray" else lambda row: None
+
+
 def _train(
     folder: RunFolder,
     config: RunConfig,
@@ -162,7 +178,8 @@ def _train(
     journal: Journal,
     cluster: Cluster,
 ) -> RunResult:
-    observer = MirroringObserver(tracker, journal, PushedMark(folder.pushed, journal.sync()), display)
+    pushed = PushedMark(folder.pushed, journal.sync())
+    observer = MirroringObserver(tracker, journal, pushed, display, _monitor(folder, config))
     with stop_on_signals() as stop:
         loop = TrainingLoop(config, cluster, journal, folder.checkpoints, observer, stop)
         if checkpoint is not None:
