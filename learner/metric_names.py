@@ -55,7 +55,7 @@ LEARNING = (
     ),
     _gauge("train/return", "train_return", "reward", "mean return of those episodes", "rises"),
     _gauge("train/episode_length", "train_episode_length", "env steps", "their mean length", "below the horizon"),
-    _gauge("train/loss", "loss", "reward²", "mean Huber loss", "small, without growth"),
+    _gauge("train/loss", "loss", "squared reward", "mean Huber loss", "small, without growth"),
     _gauge("train/td_error", "td_error", "reward", "mean absolute TD error", "small, without growth"),
     _gauge("train/q_mean", "q_mean", "reward", "mean action value in the minibatches", "bounded by the best return"),
 )
