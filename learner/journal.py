@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from sim_core.checks import ConfigError
 
-TOTAL = "total/"
-"""Begins the names of counters since the run's start, which are for monitoring: MLflow's charts want few keys."""
+ACCOUNT = "account/"
+"""Begins the names of counts since the start of the run, which are for monitoring: MLflow's charts want few keys."""
 
 
 class Row(NamedTuple):

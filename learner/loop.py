@@ -18,7 +18,7 @@ from actors.transitions import BlockReport, EpisodeStats
 from learner.checkpoint import Checkpoint, keep_newest, write_checkpoint
 from learner.cluster import Cluster
 from learner.config import RunConfig, config_hash
-from learner.journal import TOTAL, Journal, Row
+from learner.journal import ACCOUNT, Journal, Row
 from learner.meters import Meters
 from learner.node import UpdateReport
 from learner.pacing import PacingState, make_pacer
@@ -108,7 +108,7 @@ class TrainingLoop:
             self._start_updates()  # sample, update, publish: when the pacer says so
             self._take_results()
             if self._is_due("log", self._config.log_every_env_steps):
-                self._write_row(self._meters.row(self._replay_size(), self._pacer.ratio()) | self._totals())
+                self._write_row(self._meters.row(self._replay_size(), self._pacer.ratio()) | self._account())
             if self._is_due("checkpoint", self._config.checkpoint_every_env_steps):
                 self.checkpoint()
         if self._saved_at != (self.env_steps, self.updates):
@@ -192,12 +192,12 @@ class TrainingLoop:
         self._journal.append(row)
         self._observer.row(row)
 
-    def _totals(self) -> dict[str, float]:
+    def _account(self) -> dict[str, float]:
         waits = self._pacer.state
         return {
-            f"{TOTAL}updates": self.updates,
-            f"{TOTAL}waits_to_insert": waits.waits_to_insert,
-            f"{TOTAL}waits_to_sample": waits.waits_to_sample,
+            f"{ACCOUNT}updates": self.updates,
+            f"{ACCOUNT}waits_to_insert": waits.waits_to_insert,
+            f"{ACCOUNT}waits_to_sample": waits.waits_to_sample,
         }
 
     def _replay_size(self) -> int:

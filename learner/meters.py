@@ -8,7 +8,7 @@ from typing import Any
 import psutil
 
 from actors.transitions import NO_OUTCOME, BlockReport
-from learner.journal import TOTAL
+from learner.journal import ACCOUNT
 from learner.node import UpdateReport
 from sim_core.outcomes import Outcome
 
@@ -56,7 +56,7 @@ class Meters:
         """The metrics since the last row; starts the next."""
         metrics = {"train/epsilon": self._epsilon, "replay/size": float(replay_size)}
         metrics["replay/samples_per_insert"] = samples_per_insert
-        metrics[f"{TOTAL}episodes"] = self._episodes
+        metrics[f"{ACCOUNT}episodes"] = self._episodes
         metrics |= self._means("train/", "episodes", {"return": "episode_return", "episode_length": "episode_length"})
         metrics |= self._means("train/", "named", {"success_rate": "successes"})
         metrics |= self._means("train/", "calls", {"loss": "loss", "q_mean": "q_mean", "td_error": "td_error"})

@@ -38,8 +38,8 @@ def _counter(journal: str, name: str, unit: str, meaning: str, healthy: str) -> 
 
 THROUGHPUT = (
     _counter(ENV_STEPS, "env_steps", "env steps", "made by the run, those before a resume included", "grows"),
-    _counter("total/updates", "updates", "updates", "made by the run, those before a resume included", "grows"),
-    _counter("total/episodes", "episodes", "episodes", "that ended in training", "grows"),
+    _counter("account/updates", "updates", "updates", "made by the run, those before a resume included", "grows"),
+    _counter("account/episodes", "episodes", "episodes", "that ended in training", "grows"),
     _gauge("speed/env_steps_per_s", "env_steps_per_second", "env steps/s", "since the last row", "steady"),
     _gauge("speed/updates_per_s", "updates_per_second", "updates/s", "since the last row", "steady"),
 )
@@ -112,14 +112,14 @@ REPLAY = (
         "a few seconds",
     ),
     _counter(
-        "total/waits_to_insert",
+        "account/waits_to_insert",
         "waits_to_insert",
         "rounds",
         "of the loop in which a rollout worker had to wait for the learner",
         "grows where the learner is the slower side",
     ),
     _counter(
-        "total/waits_to_sample",
+        "account/waits_to_sample",
         "waits_to_sample",
         "rounds",
         "of the loop in which the learner had to wait for transitions",

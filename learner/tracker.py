@@ -19,7 +19,7 @@ import torch
 from actors.network import QNetwork, WeightsSnapshot, load_snapshot
 from actors.vector_env import EnvShape
 from learner.config import RunConfig, config_hash
-from learner.journal import TOTAL, Row
+from learner.journal import ACCOUNT, Row
 from learner.views import TAG, packed_view, sweep_views
 from sim_core.checks import ConfigError
 
@@ -134,12 +134,12 @@ class Tracker:
         self.run_id = run_id
 
     def push(self, rows: list[Row]) -> None:
-        """Mirrors journal rows without their totals; a row that is there already is stored once."""
+        """Mirrors journal rows without their accounts; a row that is there already is stored once."""
         metrics = [
             Metric(key, value, row.time_ms, row.env_steps)
             for row in rows
             for key, value in row.metrics.items()
-            if math.isfinite(value) and not key.startswith(TOTAL)
+            if math.isfinite(value) and not key.startswith(ACCOUNT)
         ]
         for start in range(0, len(metrics), MAX_BATCH):
             self._client.log_batch(self.run_id, metrics=metrics[start : start + MAX_BATCH])

@@ -19,7 +19,7 @@ PLACE = "cluster.json"
 
 
 class SimulatedCluster:
-    """The nodes, from outside their process; `environment` is what a driver needs, `folder` is Ray's."""
+    """The nodes, from outside their process; `environment` is what a driver needs, `folder` holds their files."""
 
     def __init__(self) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix="shoal-", dir="/tmp"))  # Ray's sockets want a short path

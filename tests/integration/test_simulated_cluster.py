@@ -90,7 +90,7 @@ def test_who_has_not_the_token_is_told_so(nodes, tmp_path, token):
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     last = done.stderr.splitlines()[-1]
-    assert last.startswith("shoal: no Ray cluster answers") and "RAY_AUTH_TOKEN" in last
+    assert last.startswith("shoal: ") and nodes.address in last and "RAY_AUTH_TOKEN" in last
 
 
 class Prometheus:
@@ -101,7 +101,8 @@ class Prometheus:
         (job,) = config["scrape_configs"]
         (places,) = job["file_sd_configs"]
         assert places["files"] == ["/tmp/ray/prom_metrics_service_discovery.json"], "where Ray's head writes by default"
-        places |= {"files": [str(nodes.folder / "prom_metrics_service_discovery.json")], "refresh_interval": "1s"}
+        written = nodes.folder / "ray" / "prom_metrics_service_discovery.json"
+        places |= {"files": [str(written)], "refresh_interval": "1s"}
         config["global"] = {"scrape_interval": "1s", "evaluation_interval": "1s"}
         (folder / "prometheus.yml").write_text(yaml.safe_dump(config))
         shutil.copy(PROMETHEUS / "alerts.yml", folder)

@@ -49,7 +49,7 @@ def test_a_row_holds_means_over_episodes_blocks_and_calls():
         "policy/staleness_s": 1.0,
         "replay/size": 1234.0,
         "replay/samples_per_insert": 3.5,
-        "total/episodes": 4,
+        "account/episodes": 4,
     }
     assert expected.items() <= row.items()
     rest = {name for name in row if name not in expected}
@@ -121,7 +121,7 @@ def test_episodes_are_counted_over_rows_and_restarts():
     resumed = Meters()
     resumed.set_state(json.loads(json.dumps(meters.get_state())))
     resumed.take_block(report([2], [0.0], [5]))
-    assert resumed.row(0, 1.0)["total/episodes"] == 7
+    assert resumed.row(0, 1.0)["account/episodes"] == 7
 
 
 def test_a_state_from_before_episodes_were_counted_starts_them_at_0():
@@ -130,7 +130,7 @@ def test_a_state_from_before_episodes_were_counted_starts_them_at_0():
     resumed = Meters()
     resumed.set_state(state)
     row = resumed.row(0, 1.0)
-    assert (row["total/episodes"], row["train/return"]) == (0, 1.0)
+    assert (row["account/episodes"], row["train/return"]) == (0, 1.0)
 
 
 def test_a_saved_state_does_not_change_with_the_meters():

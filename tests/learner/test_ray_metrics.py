@@ -46,9 +46,9 @@ def told(monkeypatch):
 
 def test_gauges_show_the_newest_values_and_counters_what_was_added(told):
     metrics = RayMetrics("r")
-    metrics.row(Row(100, 0, {"train/epsilon": 0.5, "total/updates": 8}))
+    metrics.row(Row(100, 0, {"train/epsilon": 0.5, "account/updates": 8}))
     assert told() == {"shoal_epsilon": 0.5, "shoal_env_steps": 100, "shoal_updates": 8}
-    metrics.row(Row(150, 0, {"train/epsilon": 0.4, "total/updates": 12, "total/episodes": 3}))
+    metrics.row(Row(150, 0, {"train/epsilon": 0.4, "account/updates": 12, "account/episodes": 3}))
     assert told() == {"shoal_epsilon": 0.4, "shoal_env_steps": 50, "shoal_updates": 4, "shoal_episodes": 3}
 
 
@@ -62,9 +62,9 @@ def test_what_a_row_did_not_measure_is_shown_again_because_ray_forgets(told):
 
 def test_the_row_of_an_earlier_evaluation_takes_nothing_back(told):
     metrics = RayMetrics("r")
-    metrics.row(Row(300, 0, {"total/updates": 8}))
+    metrics.row(Row(300, 0, {"account/updates": 8}))
     metrics.row(Row(200, 0, {"eval/return": 1.0}))
-    metrics.row(Row(350, 0, {"total/updates": 9}))
+    metrics.row(Row(350, 0, {"account/updates": 9}))
     added = [(name, value) for name, value, _ in Told.calls if name == "shoal_env_steps"]
     assert added == [("shoal_env_steps", 300), ("shoal_env_steps", 50)]
 
