@@ -95,14 +95,14 @@ REPLAY = (
         "samples_per_insert",
         "ratio",
         "how often a transition has been sampled on average",
-        "within 5 % of the setting once the replay is past `min_replay` many times over",
+        "approaches the setting: within 5 % of it after 20 x `min_replay` transitions",
     ),
     _gauge(
         "policy/staleness_updates",
         "broadcast_lag_updates",
         "updates",
         "age of the acting weights when a block is stored",
-        "below ten calls of updates (`updates_per_call`)",
+        "a few calls of updates (`updates_per_call`)",
     ),
     _gauge(
         "policy/staleness_s",
