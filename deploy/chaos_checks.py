@@ -6,7 +6,7 @@ from contextlib import closing
 
 import mlflow
 
-from learner.journal import Journal, Row
+from learner.journal import ACCOUNT, Journal, Row, charted
 from learner.run import resume_point
 from learner.run_folder import RunFolder
 
@@ -33,11 +33,11 @@ def complaints(folder: RunFolder) -> list[str]:
 
 def _unbalanced(rows: list[Row]) -> list[str]:
     """Rows at which the accounts did not balance."""
-    accounts = [(row.env_steps, row.metrics) for row in rows if "account/produced" in row.metrics]
+    accounts = [(row.env_steps, row.metrics) for row in rows if f"{ACCOUNT}produced" in row.metrics]
     return [
         f"at {env_steps} env steps the accounts do not balance"
         for env_steps, metrics in accounts
-        if metrics["account/produced"] != metrics["account/stored"] + metrics["account/dropped"]
+        if metrics[f"{ACCOUNT}produced"] != metrics[f"{ACCOUNT}stored"] + metrics[f"{ACCOUNT}dropped"]
     ]
 
 
@@ -46,7 +46,7 @@ def _undelivered(folder: RunFolder, rows: list[Row]) -> list[str]:
     identity = folder.identity()
     client = mlflow.MlflowClient(identity.tracking_uri)
     wrong = []
-    for key in sorted({key for row in rows for key in row.metrics}):
+    for key in sorted({key for row in rows for key in charted(row.metrics)}):
         expected = sorted((row.time_ms, row.env_steps, row.metrics[key]) for row in rows if key in row.metrics)
         history = client.get_metric_history(identity.mlflow_run_id, key)
         found = sorted((metric.timestamp, metric.step, metric.value) for metric in history)

@@ -13,6 +13,14 @@ from typing import NamedTuple
 
 from sim_core.checks import ConfigError
 
+ACCOUNT = "account/"
+"""Begins the names of counts since the start of the run, which are for monitoring: MLflow's charts want few keys."""
+
+
+def charted(metrics: dict[str, float]) -> dict[str, float]:
+    """What of a row goes to MLflow: all but the accounts."""
+    return {name: value for name, value in metrics.items() if not name.startswith(ACCOUNT)}
+
 
 class Row(NamedTuple):
     """Metrics of one moment: env steps, wall time in milliseconds, values by name."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from actors.transitions import BlockReport, Delivered, Dropped
+from learner.journal import ACCOUNT
 
 ROWS, ENV_STEPS, EPISODES = range(3)
 
@@ -100,10 +101,10 @@ class Ledger:
     def row(self) -> dict[str, float]:
         """The accounts as metrics."""
         return {
-            "account/produced": float(self.produced),
-            "account/stored": float(self.stored),
-            "account/dropped": float(sum(self.dropped.values())),
-            "account/episodes": float(self.episodes),
+            f"{ACCOUNT}produced": float(self.produced),
+            f"{ACCOUNT}stored": float(self.stored),
+            f"{ACCOUNT}dropped": float(sum(self.dropped.values())),
+            f"{ACCOUNT}episodes": float(self.episodes),
         }
 
     def get_state(self) -> dict[str, Any]:

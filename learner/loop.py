@@ -19,7 +19,7 @@ from actors.transitions import BlockReport, EpisodeStats
 from learner.checkpoint import Checkpoint, keep_newest, write_checkpoint
 from learner.cluster import Cluster
 from learner.config import RunConfig, config_hash
-from learner.journal import Journal, Row
+from learner.journal import ACCOUNT, Journal, Row
 from learner.ledger import Ledger
 from learner.mending import FaultObserver, Mender, RunLost
 from learner.meters import Meters
@@ -146,6 +146,7 @@ class TrainingLoop:
         while self._under_way.count("update") < self._cluster.updates_in_flight:
             updates = self._pacer.updates_due()
             if not updates:
+                self._pacer.waited(to_insert=False)
                 return
             self._pacer.sampling(updates)
             rate, exponent = (
@@ -229,8 +230,15 @@ class TrainingLoop:
 
     def _training_row(self) -> dict[str, float]:
         row = self._meters.row(self._ledger.replay_size, self._pacer.ratio()) | self._ledger.row()
-        counts = {"sampled": self._pacer.state.sampled, "updates": self.updates, "restarts": self._mender.restarts}
-        return row | {f"account/{name}": float(count) for name, count in counts.items()}
+        pacing = self._pacer.state
+        counts = {
+            "sampled": pacing.sampled,
+            "updates": self.updates,
+            "waits_to_insert": pacing.waits_to_insert,
+            "waits_to_sample": pacing.waits_to_sample,
+            "restarts": self._mender.restarts,
+        }
+        return row | {f"{ACCOUNT}{name}": float(count) for name, count in counts.items()}
 
     def _is_due(self, what: str, every: int) -> bool:
         """Whether `env_steps` has passed the next multiple of `every`; moves on to the one after."""

@@ -15,6 +15,7 @@ import ray
 from ray.actor import ActorHandle
 from ray.exceptions import (
     ActorUnavailableError,
+    AuthenticationError,
     GetTimeoutError,
     NodeDiedError,
     ObjectLostError,
@@ -168,7 +169,7 @@ def connect(cpus: int, address: str | None) -> None:
     """Joins the cluster at `address`, or starts Ray on this machine with room for `cpus` CPU slots.
 
     Raises:
-      ConfigError: the cluster cannot be reached or has too few CPUs.
+      ConfigError: the cluster cannot be reached, wants another token, or has too few CPUs.
     """
     if ray.is_initialized():
         return  # an earlier attempt of this run has joined
@@ -180,8 +181,11 @@ def connect(cpus: int, address: str | None) -> None:
         options = {"address": "local", "include_dashboard": False, "num_cpus": max(cpus, os.cpu_count() or 1)}
     try:
         ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
-    except ConnectionError as error:
-        raise ConfigError(f"no Ray cluster answers at {address!r}; start one with `ray start --head`") from error
+    except (ConnectionError, AuthenticationError) as error:
+        raise ConfigError(
+            f"no Ray cluster answers at {address!r} with this token; start one with `ray start --head`, and give this "
+            "process the cluster's token (RAY_AUTH_TOKEN, RAY_AUTH_TOKEN_PATH or ~/.ray/auth_token)"
+        ) from error
     have = cluster_cpus()
     if have < cpus:
         ray.shutdown()

@@ -20,6 +20,7 @@ from learner.loop import TrainingLoop
 from learner.mending import RunLost
 from learner.place import Place
 from learner.ray_edge import ray_cluster
+from learner.ray_metrics import RayMetrics
 from learner.results import Evaluation, final_metrics, summarise
 from learner.run_folder import RunFolder
 from learner.stopping import stop_on_signals
@@ -59,13 +60,22 @@ class MirroringObserver:
       delivery: carries the journal to MLflow.
       faults: the run's log of faults.
       display: shows all to a person.
+      monitor: is given every row too.
       resumed: whether this process goes on with the run of another one.
     """
 
-    def __init__(self, delivery: Delivery, faults: FaultLog, display: Display, resumed: bool) -> None:
+    def __init__(
+        self,
+        delivery: Delivery,
+        faults: FaultLog,
+        display: Display,
+        monitor: Callable[[Row], None],
+        resumed: bool,
+    ) -> None:
         self._delivery = delivery
         self._faults = faults
         self._display = display
+        self._monitor = monitor
         self._resumed = resumed
 
     def ready(self) -> None:
@@ -76,6 +86,7 @@ class MirroringObserver:
     def row(self, row: Row) -> None:
         """Shows the row."""
         self._display.row(row)
+        self._monitor(row)
 
     def checkpoint(self, folder: Path, journal_offset: int) -> None:
         """Asks for the delivery of the rows that the checkpoint covers."""
@@ -179,14 +190,16 @@ def _train(
     recovery, faults = Recovery(), FaultLog(folder.faults)
     incarnation = checkpoint.state["incarnation"] + 1 if checkpoint else 0
     resumed = checkpoint is not None
+    monitor: Callable[[Row], None] | None = None
     while True:
         offset = checkpoint.state["journal_offset"] if checkpoint else 0
         with closing(Journal(folder.journal, offset)) as journal:
             cluster = open_cluster(config, incarnation, place)
+            monitor = monitor or _monitor(folder, config)
             delivery = Delivery(tracker, journal, PushedMark(folder.pushed, offset), display.message)
             delivery.up_to(offset)
             with closing(delivery):
-                observer = MirroringObserver(delivery, faults, display, resumed)
+                observer = MirroringObserver(delivery, faults, display, monitor, resumed)
                 try:
                     result = _attempt(folder, config, display, checkpoint, journal, cluster, observer, recovery)
                 except RunLost as lost:
@@ -220,6 +233,11 @@ def _restore(loop: TrainingLoop, checkpoint: Checkpoint) -> None:
     except ValueError as error:
         cause = getattr(error, "cause", error)  # what a Ray actor raised stands behind Ray's own error
         raise CheckpointError(f"checkpoint {checkpoint.folder} does not fit this run: {cause}") from error
+
+
+def _monitor(folder: RunFolder, config: RunConfig) -> Callable[[Row], None]:
+    """Shows rows to Prometheus where this process has joined a Ray."""
+    return RayMetrics(folder.path.name).row if config.engine == "ray" else lambda row: None
 
 
 def _attempt(

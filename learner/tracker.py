@@ -21,7 +21,7 @@ import torch
 from actors.network import QNetwork, WeightsSnapshot, load_snapshot
 from actors.vector_env import EnvShape
 from learner.config import RunConfig, config_hash
-from learner.journal import Row
+from learner.journal import Row, charted
 from learner.views import TAG, packed_view, sweep_views
 from sim_core.checks import ConfigError
 
@@ -151,11 +151,11 @@ class Tracker:
         self.run_id, self.started_ms = run_id, run.info.start_time
 
     def push(self, rows: list[Row]) -> None:
-        """Mirrors journal rows; a row that is there already is stored once."""
+        """Mirrors journal rows without their accounts; a row that is there already is stored once."""
         metrics = [
             Metric(key, value, row.time_ms, row.env_steps)
             for row in rows
-            for key, value in row.metrics.items()
+            for key, value in charted(row.metrics).items()
             if math.isfinite(value)
         ]
         for start in range(0, len(metrics), MAX_BATCH):

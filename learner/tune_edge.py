@@ -19,6 +19,7 @@ from ray import tune
 
 from learner.journal import Row
 from learner.ray_edge import cluster_cpus, connect
+from learner.ray_metrics import RayMetrics
 from learner.sweep import Cell, SweepConfig
 from learner.trial import SweepPlace, run_cell
 
@@ -55,12 +56,14 @@ class CellListener(Protocol):
 
 
 class _Reporter:
-    """Hands a cell's rows to Tune, not too often."""
+    """Hands a cell's rows to Ray's metrics, and to Tune, not too often."""
 
-    def __init__(self) -> None:
+    def __init__(self, key: str) -> None:
+        self._metrics = RayMetrics(key)
         self._last_s = 0.0
 
     def __call__(self, row: Row) -> None:
+        self._metrics.row(row)
         now_s = time.monotonic()
         if now_s - self._last_s >= REPORT_EVERY_S:
             self._last_s = now_s
@@ -69,7 +72,7 @@ class _Reporter:
 
 def _train_cell(params: dict[str, Any], sweep: SweepConfig, cells: dict[str, Cell], place: SweepPlace) -> None:
     """Tune's trainable."""
-    run_cell(sweep, cells[params["cell"]], place, _Reporter())
+    run_cell(sweep, cells[params["cell"]], place, _Reporter(params["cell"]))
 
 
 class _Callback(tune.Callback):

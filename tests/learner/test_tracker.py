@@ -93,6 +93,11 @@ def test_what_is_no_number_is_left_out(tracker):
     assert run_of(tracker).data.metrics == {"c": 2.0}
 
 
+def test_accounts_stay_in_the_journal(tracker):
+    tracker.push([Row(1, 1_700_000_000_000, {"train/loss": 1.0, "account/updates": 8.0})])
+    assert run_of(tracker).data.metrics.keys() == {"train/loss"}
+
+
 def test_final_results_stand_at_step_0(tracker):
     tracker.final({"success_rate": 0.75}, 1_700_000_000_000)
     assert history(tracker, "final/success_rate") == [(0, 1_700_000_000_000, 0.75)]

@@ -1,0 +1,35 @@
+"""What tests of deployment files need to know of the project and the machine."""
+
+import io
+import socket
+import tomllib
+from pathlib import Path
+
+from dockerfile_parse import DockerfileParser
+
+ROOT = Path(__file__).parents[2]
+CONTAINERFILE = ROOT / "deploy" / "Containerfile"
+
+
+def project():
+    """The [project] table of pyproject.toml."""
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def instructions():
+    """The container file's instructions, parsed."""
+    parser = DockerfileParser(fileobj=io.BytesIO(CONTAINERFILE.read_bytes()))
+    return [(part["instruction"], part["value"]) for part in parser.structure if part["instruction"] != "COMMENT"]
+
+
+def image_ray_version() -> str:
+    """The Ray that the image holds."""
+    (value,) = [value for name, value in instructions() if name == "ARG" and value.startswith("RAY_VERSION=")]
+    return value.partition("=")[2]
+
+
+def free_port() -> int:
+    """A port of the loopback that nothing listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]

@@ -1,0 +1,79 @@
+"""`ray up`: our cluster file as Ray itself reads it."""
+
+import copy
+import re
+import shlex
+
+import click
+import jsonschema
+import pytest
+from ray.autoscaler._private.util import prepare_config, validate_config
+from ray.scripts.scripts import start as ray_start
+
+from tests.deploy.manifests import ROOT, read_yaml
+from tests.deploy.project import image_ray_version
+
+(CONFIG,) = read_yaml(ROOT / "deploy" / "ray-cluster.yml")
+
+
+def check(config):
+    """What `ray up` does before it reaches out."""
+    prepared = prepare_config(copy.deepcopy(config))
+    validate_config(prepared)
+    return prepared
+
+
+def test_ray_takes_it():
+    prepared = check(CONFIG)
+    (kind,) = prepared["available_node_types"].values()
+    assert kind["min_workers"] == kind["max_workers"] == len(CONFIG["provider"]["worker_ips"]) == 2
+    for name in ("head_start_ray_commands", "worker_start_ray_commands"):
+        assert prepared[name] == CONFIG[name], "ours, not the defaults"
+
+
+@pytest.mark.parametrize(
+    ("way", "name", "wrong"),
+    [
+        ((), "setup_commands", "set_up_commands"),
+        ((), "head_start_ray_commands", "head_start_commands"),
+        (("auth",), "ssh_private_key", "ssh_key"),
+    ],
+)
+def test_a_misspelt_field_is_found(way, name, wrong):
+    config = copy.deepcopy(CONFIG)
+    place = config
+    for step in way:
+        place = place[step]
+    place[wrong] = place.pop(name)
+    with pytest.raises(jsonschema.ValidationError, match=wrong):
+        check(config)
+
+
+def test_a_misspelt_address_is_found():
+    config = copy.deepcopy(CONFIG)
+    config["provider"]["head_ips"] = config["provider"].pop("head_ip")
+    with pytest.raises(click.ClickException, match="head_ip"):
+        check(config)
+
+
+@pytest.mark.parametrize("name", ["head_start_ray_commands", "worker_start_ray_commands"])
+def test_ray_start_knows_every_flag_and_asks_for_the_token(name):
+    (command,) = [text for text in CONFIG[name] if " start " in text]
+    _, found, arguments = command.partition("~/venv/bin/ray start ")
+    assert found and "RAY_AUTH_MODE=token" in command
+    ray_start.make_context("start", shlex.split(arguments))  # click refuses what it does not know
+    assert "--metrics-export-port=8080" in arguments
+
+
+def test_the_ports_of_head_and_workers_fit():
+    head, worker = (" ".join(CONFIG[name]) for name in ("head_start_ray_commands", "worker_start_ray_commands"))
+    (port,) = re.findall(r"--port=(\d+)", head)
+    assert f"--address=$RAY_HEAD_IP:{port}" in worker
+
+
+def test_nodes_get_the_token_and_the_ray_of_the_image():
+    assert CONFIG["file_mounts"]["~/.ray/auth_token"] == "~/.ray/auth_token"
+    (install,) = [text for text in CONFIG["setup_commands"] if "pip install" in text]
+    assert f"ray[default,tune]=={image_ray_version()}" in install
+    (project,) = [target for target, source in CONFIG["file_mounts"].items() if source == "."]
+    assert install.endswith(project)

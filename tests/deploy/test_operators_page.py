@@ -1,0 +1,88 @@
+"""The operator's page: its sizes follow from the measured numbers that it names, its links and commands exist."""
+
+import math
+import re
+import shlex
+
+import pytest
+
+from deploy.cli import parse
+from tests.deploy.manifests import ROOT
+
+PAGE = (ROOT / "deploy" / "README.md").read_text()
+MEASURED = (ROOT / "README.md").read_text()
+CELLS_A_NODE = 8
+
+
+def number(text: str) -> float:
+    return float(text.replace(",", ""))
+
+
+def benchmark(row: str, column: int) -> float:
+    """A number of the README's benchmark tables: the first in the column of the row that begins so."""
+    (line,) = [line for line in MEASURED.splitlines() if line.startswith("│") and row in line]
+    return number(re.search(r"[\d,.]+", line.split("│")[column])[0])
+
+
+def table(heading: str) -> list[list[str]]:
+    """Cells of the page's table that begins with `heading`."""
+    lines = PAGE.splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith(f"| {heading} |"))
+    rows = []
+    for line in lines[start + 2 :]:
+        if not line:
+            return rows
+        rows.append([cell.strip() for cell in line.strip("|").split("|")])
+    raise AssertionError(f"the table {heading} has no end")
+
+
+@pytest.fixture(scope="module")
+def model():
+    """(bare simulator to rollout worker, env steps/s that one learner takes up), from the README's tables."""
+    updates, share = benchmark("bare learner, batch 256", 3), benchmark("service over Ray", 4)
+    kept = number(re.search(r"· ([\d.]+)", next(x for x in MEASURED.splitlines() if "service over Ray" in x))[1])
+    assert share == 0.29 and f"{updates:.0f} × {kept} × 256 / 2" in PAGE
+    return benchmark("rollout worker, one core", 4), updates * kept * 256 / 2
+
+
+def test_workers_of_a_learner_follow_from_the_benchmarks(model):
+    ratio, taken_up = model
+    assert f"≈ {round(taken_up, -3):,.0f} env steps/s" in PAGE
+    for setup, rate, workers, cpus in table("setup"):
+        if setup == "10r×2g":
+            expected = benchmark("rollout worker, one core", 2)
+        else:
+            expected = benchmark(f" {setup} ", 5) * ratio
+        stated = number(re.search(r"([\d,]+)(?: \(measured\))?$", rate)[1])
+        assert stated == pytest.approx(expected, rel=0.03)
+        assert int(workers) == math.ceil(taken_up / stated)
+        assert int(cpus) == int(workers) + 2, "the learner and the driver"
+
+
+def test_what_fits_on_nodes_follows_from_the_table_of_setups():
+    needs = {setup: int(cpus) for setup, _, _, cpus in table("setup")}
+    for nodes, trainings, cells, _ in table("nodes"):
+        assert int(cells) == CELLS_A_NODE * int(nodes)
+        small, large = re.fullmatch(r"(\d+) of 10r×2g, or (\d+ of \S+)", trainings).groups()
+        assert int(small) == CELLS_A_NODE // needs["10r×2g"] * int(nodes), "each on one node"
+        count, setup = large.split(" of ")
+        assert int(count) == CELLS_A_NODE * int(nodes) // needs[setup]
+
+
+def test_links_lead_somewhere():
+    links = re.findall(r"\]\(([^)#]+)[^)]*\)", PAGE)
+    assert len(links) > 8
+    assert not [link for link in links if not (ROOT / "deploy" / link).exists()]
+
+
+def test_commands_of_ours_are_understood():
+    commands = re.findall(r"(?:^|[ /])shoal ((?:train|sweep) [^'\n#]*?)\s*(?:['#]|$)", PAGE, re.MULTILINE)
+    assert len(commands) >= 4
+    for command in commands:
+        parse(shlex.split(command))
+
+
+def test_files_that_commands_name_exist():
+    names = set(re.findall(r"\bdeploy/[\w./-]+\.yml|\bdeploy/Containerfile\b", PAGE))
+    assert {"deploy/Containerfile", "deploy/ray-cluster.yml", "deploy/kubernetes/rayjob.yml"} <= names
+    assert not [name for name in names if not (ROOT / name).is_file()]
