@@ -171,4 +171,26 @@ class Watch:
         require(0 <= self.seed < 2**32, f"--seed must be in 0..{2**32 - 1}, not {self.seed}")
 
 
-Command = Train | Sweep | Report | Resume | Evaluate | Watch
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a policy as ONNX and as a torch ExportedProgram, checked against the simulator."""
+
+    run: Positional[str]
+    """Name of the run, or its folder; or one of its checkpoints, or a policy.safetensors in its folder."""
+    bare: bool = False
+    """Observation to action values alone, for any environment; else from what a robot senses to its velocity."""
+    out: Path | None = None
+    """Folder to write, replaced if it is there; `export` or `export-bare` in the run's artifacts by default."""
+    states: int = 10_000
+    """States of rollouts in which both files must answer as the simulator and its policy do."""
+    first_seed: int = 2_000_000_000
+    """Seed of the first episode of these rollouts; the others count on."""
+    runs_dir: Path = Path("runs")
+    """Folder of all runs."""
+
+    def __post_init__(self) -> None:
+        require(1 <= self.states <= 1_000_000, f"--states must be in 1..1000000, not {self.states}")
+        require(0 <= self.first_seed < 2**31, f"--first-seed must be in 0..{2**31 - 1}, not {self.first_seed}")
+
+
+Command = Train | Sweep | Report | Resume | Evaluate | Watch | Export
