@@ -7,12 +7,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, Suppress
 
 from learner.config import RunConfig
 from learner.presets import PresetName
 from learner.sweep import SweepConfig
 from sim_core.checks import require
+
+JOB = "RAY_JOB_CONFIG_JSON_ENV_VAR"
+"""Ray sets it for the command of a submitted job."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +32,12 @@ class Launch:
     """MLflow experiment."""
     address: str | None = None
     """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.runs_dir.is_absolute() or JOB not in os.environ,
+            f"a Ray job runs in a copy of its folder, where --runs-dir {self.runs_dir} would be lost: name it absolute",
+        )
 
     def tracking(self) -> str:
         """The tracking URI in force."""
@@ -61,6 +70,8 @@ class Train:
     """TOML file with settings; flags override it. World settings stand under [world]."""
     preset: PresetName | None = None
     """Named settings of --method in place of the defaults, those of `shoal sweep`; flags override them."""
+    or_resume: bool = False
+    """Go on with the run of this --name where it is there, which must have the same settings; needs --name."""
     run: RunConfig = field(default_factory=RunConfig)
     """What to learn."""
     launch: Launch = field(default_factory=Launch)
@@ -193,4 +204,27 @@ class Export:
         require(0 <= self.first_seed < 2**31, f"--first-seed must be in 0..{2**31 - 1}, not {self.first_seed}")
 
 
-Command = Train | Sweep | Report | Resume | Evaluate | Watch | Export
+@dataclass(frozen=True, kw_only=True)
+class Submit:
+    """Run `shoal train ...` or `shoal sweep ...` as a job of a Ray cluster, and follow its log.
+
+    The command and its arguments come last, as they would stand after `shoal`. Ctrl-C stops the job, which saves a
+    checkpoint; the same `shoal submit` again goes on with it, or follows it where it still runs.
+    """
+
+    address: str | None = None
+    """The cluster's dashboard; RAY_API_SERVER_ADDRESS, or http://127.0.0.1:8265 by default."""
+    working_dir: Path = Path(".")
+    """A checkout of shoal, which the job runs; what its .gitignore names is not uploaded."""
+    stop_wait_s: int = 120
+    """Time that a stopped job has to save a checkpoint before it is killed."""
+    follow: bool = True
+    """Follow the job's log until it has ended; else return once it is submitted."""
+    command: Suppress[tuple[str, ...]] = ()
+    """The job's command, `train` or `sweep`, with its arguments."""
+
+    def __post_init__(self) -> None:
+        require(self.stop_wait_s >= 1, f"--stop-wait-s must be at least 1, not {self.stop_wait_s}")
+
+
+Command = Train | Sweep | Report | Resume | Evaluate | Watch | Export | Submit

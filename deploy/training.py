@@ -15,8 +15,8 @@ from deploy.folders import check_plain_name, make_folder
 from deploy.options import Launch, Resume, Train, ray_address
 from deploy.progress import make_display
 from deploy.tables import evaluation_table, summary_lines
-from learner.checkpoint import Checkpoint
-from learner.config import RunConfig
+from learner.checkpoint import PREFIX, Checkpoint
+from learner.config import RunConfig, config_hash
 from learner.journal import Row
 from learner.run import RunResult, execute, resume_point
 from learner.run_folder import RunFolder, RunIdentity, find_run
@@ -24,12 +24,16 @@ from learner.tracker import Tracker
 from sim_core.checks import require
 
 
-def _new_folder(config: RunConfig, launch: Launch) -> RunFolder:
+def run_base(config: RunConfig) -> str:
+    """What names of runs with `config` begin with."""
+    return config.name.replace("×", "").replace(" ", "-").replace("/", "-")
+
+
+def _new_folder(config: RunConfig, launch: Launch, or_resume: bool) -> RunFolder:
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    base = config.name.replace("×", "").replace(" ", "-").replace("/", "-")
-    folder = launch.runs_dir / (launch.name or f"{base}-{stamp}")
+    folder = launch.runs_dir / (launch.name or f"{run_base(config)}-{stamp}")
     require(
-        not folder.exists(),
+        or_resume or not folder.exists(),
         f"{folder} exists already; choose another --name, or go on with `shoal resume {folder.name}`",
     )
     return RunFolder(folder)
@@ -40,7 +44,11 @@ def train(command: Train) -> int:
     config, launch = command.run, command.launch
     if launch.name is not None:
         check_plain_name(launch.name)
-    folder = _new_folder(config, launch)
+    if command.or_resume:
+        require(launch.name is not None, "--or-resume needs --name, the run to go on with")
+    folder = _new_folder(config, launch, command.or_resume)
+    if folder.has_begun():
+        return _go_on(folder, config, launch.ray_address())
     make_folder(launch.runs_dir, "--runs-dir")
     env_shape(config.env)  # refuses an environment that cannot be made
     tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
@@ -53,17 +61,49 @@ def train(command: Train) -> int:
 def resume(command: Resume) -> int:
     """Goes on with a run; returns the exit code."""
     folder = find_run(command.run, command.runs_dir)
-    config, identity = folder.config(), folder.identity()
+    config = folder.config()
     checkpoint, skipped = resume_point(folder, config)
     config = _extended(config, command.total_env_steps, checkpoint.state["env_steps"])
-    tracker = Tracker(identity.tracking_uri, identity.experiment, None)
-    tracker.resume(identity.mlflow_run_id)
-    folder.save_config(config)
-    console = Console()
+    tracker = _tracker(folder.identity())
+    _say_where(checkpoint, skipped)
+    return _resumed(folder, config, tracker, checkpoint, ray_address(command.address))
+
+
+def _go_on(folder: RunFolder, config: RunConfig, address: str | None) -> int:
+    """Goes on with a run that is not finished, from its start if it has no checkpoint; returns the exit code."""
+    known = folder.config()
+    require(
+        config_hash(known) == config_hash(config),
+        f"{folder.path} holds a run of other settings; choose another --name",
+    )
+    identity = folder.identity()
+    tracker = _tracker(identity)
+    if config.total_env_steps <= known.total_env_steps and tracker.is_finished(identity.mlflow_run_id):
+        Console().print(f"run {folder.path} has finished before", highlight=False, soft_wrap=True)
+        return 0
+    checkpoint = None
+    if any(path.suffix != ".part" for path in folder.checkpoints.glob(f"{PREFIX}*")):
+        checkpoint, skipped = resume_point(folder, config)
+        _say_where(checkpoint, skipped)
+    return _resumed(folder, config, tracker, checkpoint, address)
+
+
+def _tracker(identity: RunIdentity) -> Tracker:
+    return Tracker(identity.tracking_uri, identity.experiment, None)
+
+
+def _say_where(checkpoint: Checkpoint, skipped: list[str]) -> None:
     for reason in skipped:
-        console.print(f"skipped: {reason}", highlight=False)
-    console.print(f"going on from {checkpoint.folder}", highlight=False, soft_wrap=True)
-    return _run(folder, config, tracker, checkpoint, ray_address(command.address))
+        Console().print(f"skipped: {reason}", highlight=False)
+    Console().print(f"going on from {checkpoint.folder}", highlight=False, soft_wrap=True)
+
+
+def _resumed(
+    folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, address: str | None
+) -> int:
+    tracker.resume(folder.identity().mlflow_run_id)
+    folder.save_config(config)
+    return _run(folder, config, tracker, checkpoint, address)
 
 
 def _extended(config: RunConfig, total_env_steps: int | None, done: int) -> RunConfig:

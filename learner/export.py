@@ -135,7 +135,7 @@ def _program(module: nn.Module, ports: list[Port]) -> torch.export.ExportedProgr
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps torch's own remarks away: packages it can do without, its internals, and that axes of one size share a name."""
+    """Keeps torch's remarks away: on packages it can do without, its internals, and axes that share a name."""
     registry = logging.getLogger("torch.onnx._internal.exporter._registration")
     level = registry.level
     registry.setLevel(logging.ERROR)

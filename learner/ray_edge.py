@@ -13,6 +13,7 @@ from typing import Any
 
 import ray
 from ray.actor import ActorHandle
+from ray.exceptions import AuthenticationError
 
 from actors.calls import LocalCalls, Node, Ref
 from actors.evaluator import Candidate, evaluate_in_parts
@@ -22,6 +23,7 @@ from actors.vector_env import EnvSpec, env_shape
 from learner.cluster import Cluster, learner_settings, rollout_settings, shard_settings
 from learner.config import RunConfig
 from learner.node import LearnerNode
+from learner.ray_auth import HOW, set_auth_mode
 from sim_core.checks import ConfigError
 
 PUSHES_IN_FLIGHT = 1
@@ -105,7 +107,7 @@ def connect(cpus: int, address: str | None) -> None:
     Raises:
       ConfigError: the cluster cannot be reached or has too few CPUs.
     """
-    os.environ.setdefault("RAY_AUTH_MODE", "disabled" if address is None else "token")
+    set_auth_mode(address is not None)
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     options: dict[str, Any] = {"address": address}
     if address is None:
@@ -114,6 +116,8 @@ def connect(cpus: int, address: str | None) -> None:
         ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
     except ConnectionError as error:
         raise ConfigError(f"no Ray cluster answers at {address!r}; start one with `ray start --head`") from error
+    except AuthenticationError as error:
+        raise ConfigError(f"the Ray cluster at {address!r} asks for a token that it knows: {HOW}") from error
     have = cluster_cpus()
     if have < cpus:
         ray.shutdown()
