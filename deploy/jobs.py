@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +23,13 @@ ADDRESS = "RAY_API_SERVER_ADDRESS"
 DEFAULT_ADDRESS = "http://127.0.0.1:8265"
 STOP_WAIT = "RAY_JOB_STOP_WAIT_TIME_S"
 """How long Ray lets a stopped job's command end by itself, after SIGTERM and before SIGKILL."""
+CHATTY = (
+    "ray.dashboard.modules.dashboard_sdk",
+    "ray.dashboard.modules.job.sdk",
+    "ray._private.runtime_env.packaging",
+    "ray._private.runtime_env.working_dir",
+)
+"""Ray's loggers that tell what it uploads and when it hangs up."""
 POLL_S = 0.2
 RETRY_S = 1.0
 
@@ -53,10 +61,8 @@ class JobServer:
     def __init__(self, address: str | None) -> None:
         self.address = _url(address)
         set_auth_mode(joins=True)
-        for name in ("ray.dashboard.modules", "ray._private.runtime_env.packaging"):
-            logging.getLogger(name).setLevel(logging.WARNING)
-        logging.getLogger("ray.dashboard.modules.dashboard_sdk").setLevel(logging.WARNING)
-        logging.getLogger("ray.dashboard.modules.job.sdk").setLevel(logging.WARNING)
+        for name in CHATTY:
+            logging.getLogger(name).setLevel(logging.ERROR)
         os.environ[ADDRESS] = self.address  # Ray's client lets the environment decide, whatever it is given
         with self._explained():
             self._client = JobSubmissionClient(self.address)
@@ -127,7 +133,9 @@ class JobServer:
             finally:
                 watcher.cancel()
 
-        asyncio.run(both())
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "ssl=None is deprecated", DeprecationWarning)  # Ray's own call of aiohttp
+            asyncio.run(both())
         return self.ending(job)
 
     async def _stop_when_asked(

@@ -14,9 +14,6 @@ from learner.presets import PresetName
 from learner.sweep import SweepConfig
 from sim_core.checks import require
 
-JOB = "RAY_JOB_CONFIG_JSON_ENV_VAR"
-"""Ray sets it for the command of a submitted job."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Launch:
@@ -32,12 +29,6 @@ class Launch:
     """MLflow experiment."""
     address: str | None = None
     """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
-
-    def __post_init__(self) -> None:
-        require(
-            self.runs_dir.is_absolute() or JOB not in os.environ,
-            f"a Ray job runs in a copy of its folder, where --runs-dir {self.runs_dir} would be lost: name it absolute",
-        )
 
     def tracking(self) -> str:
         """The tracking URI in force."""

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from actors.vector_env import env_shape
 from deploy.artifacts import log_artifacts
-from deploy.folders import check_plain_name, make_folder
+from deploy.folders import check_lasting, check_plain_name, make_folder
 from deploy.options import Launch, Resume, Train, ray_address
 from deploy.progress import make_display
 from deploy.tables import evaluation_table, summary_lines
@@ -42,6 +42,7 @@ def _new_folder(config: RunConfig, launch: Launch, or_resume: bool) -> RunFolder
 def train(command: Train) -> int:
     """Starts a run; returns the exit code."""
     config, launch = command.run, command.launch
+    check_lasting(launch.runs_dir)
     if launch.name is not None:
         check_plain_name(launch.name)
     if command.or_resume:

@@ -82,12 +82,12 @@ def agreement(got: dict[str, NDArray[Any]], expected: dict[str, NDArray[Any]]) -
 
 def require_agreement(found: Agreement, file: str) -> None:
     """Raises ConfigError unless a file answers as it should."""
-    worst = max(found.errors, key=lambda name: found.errors[name])
     few = found.different <= max(1, MOST_DIFFERENT * found.states)
-    if not few or not found.errors[worst] <= TOLERANCE:
+    wrong = [name for name, error in found.errors.items() if not error <= TOLERANCE]  # so that no NaN passes
+    if not few or wrong:
         raise ConfigError(
             f"{file} does not answer as the simulator and its policy do: {found.different} of {found.states} states "
-            f"differ, the largest error of {worst} is {found.errors[worst]:.2g}; nothing was exported, report this"
+            f"differ, and errors are too large in: {', '.join(wrong) or 'nothing'}; nothing was exported, report this"
         )
 
 
