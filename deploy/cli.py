@@ -15,9 +15,21 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import tyro  # noqa: E402
 
-from deploy.options import Command, Evaluate, Export, Report, Resume, Submit, Sweep, Train, Watch  # noqa: E402
+from deploy.options import (  # noqa: E402
+    Command,
+    Evaluate,
+    Export,
+    Report,
+    Resume,
+    Submit,
+    Sweep,
+    Train,
+    Watch,
+    ray_address,
+)
 from learner.config import RunConfig, from_dict  # noqa: E402
 from learner.presets import MethodName, PresetName, preset_config  # noqa: E402
+from learner.ray_auth import set_auth_mode  # noqa: E402
 from sim_core.checks import ConfigError, require  # noqa: E402
 
 BAD_INPUT = 2
@@ -107,8 +119,18 @@ def _without_job(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     return words[:begin], [] if begin is None else words[begin:]
 
 
+def _joins_cluster(command: Command) -> bool:
+    """Whether the command speaks to a Ray cluster that is there already."""
+    if isinstance(command, Train | Sweep):
+        return command.launch.ray_address() is not None
+    return isinstance(command, Submit) or (
+        isinstance(command, Resume | Evaluate) and ray_address(command.address) is not None
+    )
+
+
 def execute(command: Command) -> int:
     """Runs a command; returns its exit code. Imports are late: help must not wait for Ray and MLflow."""
+    set_auth_mode(_joins_cluster(command))  # which Ray reads when it is imported
     if isinstance(command, Train | Resume):
         from deploy import training
 

@@ -16,7 +16,7 @@ import requests
 from ray.exceptions import AuthenticationError
 from ray.job_submission import JobStatus, JobSubmissionClient
 
-from learner.ray_auth import HOW, set_auth_mode
+from learner.ray_auth import HOW
 from sim_core.checks import ConfigError
 
 ADDRESS = "RAY_API_SERVER_ADDRESS"
@@ -60,7 +60,6 @@ class JobServer:
 
     def __init__(self, address: str | None) -> None:
         self.address = _url(address)
-        set_auth_mode(joins=True)
         for name in CHATTY:
             logging.getLogger(name).setLevel(logging.ERROR)
         os.environ[ADDRESS] = self.address  # Ray's client lets the environment decide, whatever it is given

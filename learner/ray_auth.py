@@ -24,7 +24,7 @@ def has_token() -> bool:
 
 
 def set_auth_mode(joins: bool) -> None:
-    """Sets RAY_AUTH_MODE where it is not set; before Ray is asked for anything.
+    """Sets RAY_AUTH_MODE where it is not set; before Ray is imported, which reads it then.
 
     Args:
       joins: whether a cluster is joined that others can reach, rather than a Ray of our own started.

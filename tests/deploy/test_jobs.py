@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from aiohttp import web
@@ -14,6 +15,8 @@ from aiohttp import web
 from deploy.jobs import JobServer
 from sim_core.checks import ConfigError
 
+ROOT = Path(__file__).parents[2]
+TOKEN = "a" * 64
 LOG = "".join(f"line {i}\n" for i in range(100))
 
 
@@ -104,8 +107,17 @@ def test_the_given_address_goes_before_the_environment(monkeypatch):
         assert JobServer(address).address == address
 
 
-@pytest.mark.parametrize("mode", ["disabled", "token"])
-def test_a_token_travels_where_it_is_asked_for(mode):
+@pytest.mark.parametrize(
+    ("environment", "travels"),
+    [
+        ({"RAY_AUTH_MODE": "disabled", "RAY_AUTH_TOKEN": TOKEN}, False),
+        ({"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN}, True),
+        ({"RAY_AUTH_TOKEN": TOKEN}, True),
+        ({}, False),
+    ],
+)
+def test_a_token_travels_where_there_is_one(environment, travels, monkeypatch):
+    monkeypatch.delenv("RAY_AUTH_MODE")
     seen = []
 
     async def answer(request: web.Request) -> web.Response:
@@ -113,10 +125,10 @@ def test_a_token_travels_where_it_is_asked_for(mode):
         return web.json_response({"version": "4", "ray_version": "2.60.0", "ray_commit": "x"})
 
     with serving(web.get("/api/version", answer)) as address:
-        code = f"from deploy.jobs import JobServer; JobServer({address!r})"
-        environment = {**os.environ, "RAY_AUTH_MODE": mode, "RAY_AUTH_TOKEN": "a" * 64}
-        subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=120)  # Ray reads these once
-    assert set(seen) == {f"Bearer {'a' * 64}" if mode == "token" else None}
+        command = [sys.executable, "-m", "deploy", "submit", "--address", address, "train"]
+        done = subprocess.run(command, cwd=ROOT, env={**os.environ, **environment}, timeout=120, check=False)
+    assert done.returncode == 2, "there are no jobs here"
+    assert set(seen) == {f"Bearer {TOKEN}" if travels else None}
 
 
 def job_info(status: str) -> dict:
