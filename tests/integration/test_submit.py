@@ -192,10 +192,10 @@ def test_what_git_ignores_is_not_uploaded(head, checkout, tmp_path):
 
 
 def test_ray_job_submit_runs_a_sweep(head, checkout, tmp_path):
-    """The other way in, without `shoal submit`: a sweep of its one baseline cell."""
+    """The other way in, without `shoal submit`: a sweep of one training and one baseline."""
     words = "sweep --robots 3 --groups 2 --methods sensor --baselines greedy --baseline-episodes 4 --episodes 4".split()
-    words += ["--extrapolation", "none", "--env-steps", "4000", "--seeds", "0", "--runs-dir", str(tmp_path / "runs")]
-    words += ["--set", "min_replay=1000", "hidden_sizes=[8]"]
+    words += ["--extrapolation", "none", "--env-steps", "21000", "--seeds", "0", "--runs-dir", str(tmp_path / "runs")]
+    words += ["--set", "hidden_sizes=[8]"]
     done = subprocess.run(
         [f"{Path(sys.executable).parent}/ray", "job", "submit", "--address", head.address, "--working-dir", "."]
         + ["--", "shoal", *words],
@@ -203,7 +203,7 @@ def test_ray_job_submit_runs_a_sweep(head, checkout, tmp_path):
         env={**os.environ, "RAY_AUTH_MODE": "disabled"},
         capture_output=True,
         text=True,
-        timeout=600,
+        timeout=800,
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
