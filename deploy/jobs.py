@@ -75,11 +75,11 @@ class JobServer:
             raise ConfigError(f"the Ray cluster at {self.address} asks for a token that it knows: {HOW}") from error
         except (ConnectionError, requests.RequestException) as error:
             raise ConfigError(
-                f"no Ray job server answers at {self.address}; start one with `ray start --head`, "
+                f"no Ray job server answers at {self.address} ({_cause(error)}); start one with `ray start --head`, "
                 "or name the cluster's dashboard with --address"
             ) from error
         except RuntimeError as error:  # what the server answers other than OK
-            raise ConfigError(f"the Ray job server at {self.address} refused: {_first_line(error)}") from error
+            raise ConfigError(f"the Ray job server at {self.address} refused: {_cause(error)}") from error
 
     def attempts(self, name: str) -> list[Job]:
         """The jobs that were submitted as `name`, first to last."""
@@ -176,6 +176,7 @@ def _url(address: str | None) -> str:
     return (given if separator else f"http://{given}").rstrip("/")
 
 
-def _first_line(error: Exception) -> str:
+def _cause(error: Exception) -> str:
+    """The last line of an error's text, which says what went wrong."""
     lines = [line for line in str(error).splitlines() if line.strip()]
     return lines[-1].strip() if lines else type(error).__name__

@@ -19,10 +19,14 @@ def train(runs: Path, *more: str) -> int:
     return main(["train", "--runs-dir", str(runs), "--name", "r", "--or-resume", "True", *flags(SMALL), *more])
 
 
-def the_run(runs: Path):
+def all_runs(runs: Path):
     client = mlflow.MlflowClient(f"sqlite:///{runs}/mlflow.db")
-    (run,) = client.search_runs([client.get_experiment_by_name("shoal").experiment_id])
-    return client, run
+    return client.search_runs([client.get_experiment_by_name("shoal").experiment_id])
+
+
+def the_run(runs: Path):
+    (run,) = all_runs(runs)
+    return mlflow.MlflowClient(f"sqlite:///{runs}/mlflow.db"), run
 
 
 @pytest.fixture(scope="module")
@@ -35,14 +39,20 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def runs(finished: Path, tmp_path: Path) -> Path:
-    """A copy that a test may damage; MLflow knows its run as killed."""
+def copied(finished: Path, tmp_path: Path) -> Path:
+    """A copy that a test may change, logged to a database of its own."""
     copy = Path(shutil.copytree(finished, tmp_path / "runs"))
     identity = copy / "r" / "run.json"
     identity.write_text(identity.read_text().replace(str(finished), str(copy)))
-    client, run = the_run(copy)
-    client.set_terminated(run.info.run_id, "KILLED")
     return copy
+
+
+@pytest.fixture
+def runs(copied: Path) -> Path:
+    """A copy of which MLflow knows the run as killed."""
+    client, run = the_run(copied)
+    client.set_terminated(run.info.run_id, "KILLED")
+    return copied
 
 
 def test_a_finished_run_is_left_as_it_is(finished, capsys):
@@ -53,10 +63,9 @@ def test_a_finished_run_is_left_as_it_is(finished, capsys):
     assert after.data.tags == before.data.tags and after.info.end_time == before.info.end_time
 
 
-def test_a_finished_run_trains_on_where_more_is_asked_for(finished, tmp_path):
-    copy = Path(shutil.copytree(finished, tmp_path / "runs"))
-    assert train(copy, "--total-env-steps", "8000") == 0
-    assert newest_valid(copy / "r" / "checkpoints")[0].state["env_steps"] >= 8_000
+def test_a_finished_run_trains_on_where_more_is_asked_for(copied):
+    assert train(copied, "--total-env-steps", "8000") == 0
+    assert newest_valid(copied / "r" / "checkpoints")[0].state["env_steps"] >= 8_000
 
 
 def test_a_run_killed_in_its_last_evaluation_is_evaluated(runs, finished):
@@ -78,11 +87,10 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(runs, finished):
 
 
 def test_a_run_killed_before_it_was_logged_begins_again(runs):
-    (runs / "r" / "run.json").unlink()
-    (runs / "mlflow.db").unlink()
+    (runs / "r" / "run.json").unlink()  # so its MLflow run cannot be found again
     shutil.rmtree(runs / "r" / "checkpoints")
     assert train(runs) == 0
-    assert the_run(runs)[1].info.status == "FINISHED"
+    assert sorted(run.info.status for run in all_runs(runs)) == ["FINISHED", "KILLED"]
 
 
 def test_a_run_of_other_settings_and_a_missing_name_are_refused(finished, tmp_path, capsys):

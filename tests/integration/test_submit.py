@@ -55,38 +55,6 @@ class Head(NamedTuple):
     session: Path
 
 
-@pytest.fixture(scope="module")
-def head(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Head]:
-    """`ray start --head` on this machine alone, as a user starts it on a laptop."""
-    ports = dict(zip(PORTS, free_ports(len(PORTS)), strict=True))
-    folder = Path(tempfile.mkdtemp(prefix="sh", dir="/tmp"))  # short: Ray's sockets lie in it
-    binaries = str(Path(sys.executable).parent)
-    environment = {**clean_environment(), "RAY_AUTH_MODE": "disabled"}
-    environment["PATH"] = f"{binaries}:{environment['PATH']}"
-    environment.pop("PYTHONPATH", None)  # a job's code is what was uploaded
-    flags = [f"--{name}={port}" for name, port in ports.items()]
-    log = (tmp_path_factory.mktemp("head") / "log").open("w")
-    process = subprocess.Popen(
-        [f"{binaries}/ray", "start", "--head", "--block", "--num-cpus=3", "--disable-usage-stats", *flags]
-        + ["--node-ip-address=127.0.0.1", "--dashboard-host=127.0.0.1", f"--temp-dir={folder}"],
-        env=environment,
-        stdout=log,
-        stderr=subprocess.STDOUT,
-    )
-    address = f"http://127.0.0.1:{ports['dashboard-port']}"
-    try:
-        wait_for(lambda: answers(f"{address}/api/jobs/"), lambda: Path(log.name).read_text(), process)
-        yield Head(address, folder / "session_latest")
-    finally:
-        family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
-        process.terminate()
-        process.wait(60)
-        for left in psutil.wait_procs(family, timeout=20)[1]:
-            left.kill()
-        log.close()
-        shutil.rmtree(folder, ignore_errors=True)
-
-
 def answers(url: str) -> bool:
     try:
         return requests.get(url, timeout=10).status_code == 200
@@ -100,6 +68,45 @@ def wait_for(condition, log, process: subprocess.Popen) -> None:
         assert process.poll() is None, log()
         assert time.monotonic() < deadline_s, log()
         time.sleep(0.2)
+
+
+def start_head(folder: Path, log: Path) -> tuple[subprocess.Popen, str]:
+    """(`ray start --head` on this machine alone, as a user starts it on a laptop, and its dashboard's address)."""
+    ports = dict(zip(PORTS, free_ports(len(PORTS)), strict=True))
+    binaries = str(Path(sys.executable).parent)
+    environment = {**clean_environment(), "RAY_AUTH_MODE": "disabled"}
+    environment["PATH"] = f"{binaries}:{environment['PATH']}"
+    environment.pop("PYTHONPATH", None)  # a job's code is what was uploaded
+    flags = [f"--{name}={port}" for name, port in ports.items()]
+    command = [f"{binaries}/ray", "start", "--head", "--block", "--num-cpus=3", "--disable-usage-stats", *flags]
+    command += ["--node-ip-address=127.0.0.1", "--dashboard-host=127.0.0.1", f"--temp-dir={folder}"]
+    with log.open("w") as file:
+        process = subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
+    while process.poll() is None and "Ray runtime started" not in log.read_text():
+        time.sleep(0.2)
+    return process, f"http://127.0.0.1:{ports['dashboard-port']}"
+
+
+@pytest.fixture(scope="module")
+def head(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Head]:
+    """A running head node; it is started again where Ray's own 30 s for it were too short on a busy machine."""
+    log = tmp_path_factory.mktemp("head") / "log"
+    folder = Path(tempfile.mkdtemp(prefix="sh", dir="/tmp"))  # short: Ray's sockets lie in it
+    for _ in range(3):
+        process, address = start_head(folder, log)
+        if process.poll() is None or "timed out during startup" not in log.read_text():
+            break
+    assert process.poll() is None, log.read_text()
+    family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
+    try:
+        wait_for(lambda: answers(f"{address}/api/jobs/"), log.read_text, process)
+        yield Head(address, folder / "session_latest")
+    finally:
+        process.terminate()
+        process.wait(60)
+        for left in psutil.wait_procs(family, timeout=20)[1]:
+            left.kill()
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="module")
