@@ -16,7 +16,8 @@ pytestmark = pytest.mark.filterwarnings(
 
 
 def train(runs: Path, *more: str) -> int:
-    return main(["train", "--runs-dir", str(runs), "--name", "r", "--or-resume", "True", *flags(SMALL), *more])
+    place = ["--runs-dir", str(runs), "--tracking-uri", f"sqlite:///{runs}/mlflow.db"]  # MLflow keeps one by itself
+    return main(["train", *place, "--name", "r", "--or-resume", "True", *flags(SMALL), *more])
 
 
 def all_runs(runs: Path):
