@@ -13,7 +13,6 @@ from typing import Any
 
 import ray
 from ray.actor import ActorHandle
-from ray.exceptions import AuthenticationError
 
 from actors.calls import LocalCalls, Node, Ref
 from actors.evaluator import Candidate, evaluate_in_parts
@@ -115,9 +114,9 @@ def connect(cpus: int, address: str | None) -> None:
     try:
         ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
     except ConnectionError as error:
-        raise ConfigError(f"no Ray cluster answers at {address!r}; start one with `ray start --head`") from error
-    except AuthenticationError as error:
-        raise ConfigError(f"the Ray cluster at {address!r} asks for a token that it knows: {HOW}") from error
+        raise ConfigError(
+            f"no Ray cluster answers at {address!r}; start one with `ray start --head`, or for one with tokens {HOW}"
+        ) from error
     have = cluster_cpus()
     if have < cpus:
         ray.shutdown()

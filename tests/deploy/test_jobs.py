@@ -91,7 +91,7 @@ def test_nobody_there_is_one_sentence():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
-        with pytest.raises(ConfigError, match=f"answers at http://{address}; .*ray start --head.*--address"):
+        with pytest.raises(ConfigError, match=f"answers at http://{address} .*ray start --head.*--address"):
             JobServer(address)
 
 
