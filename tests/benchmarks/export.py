@@ -1,7 +1,11 @@
 """Exported policies: how they answer in 10,000 states beside the simulator and its policy, and how long they take."""
 
+import statistics
 import tempfile
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +21,7 @@ from learner.onboard import make_robot
 from learner.presets import preset_config
 from learner.sensed import Sensed, swarm_states
 from sim_core.methods import make_method
-from tests.benchmarks.timing import rates, ratio, spread
+from tests.benchmarks.timing import Timed, ratio, spread, timed_rates
 
 SETUPS = (("sensor", 10, 2), ("sensor", 25, 8), ("in", 10, 4), ("out", 10, 4), ("out", 25, 8))
 STATES = 10_000
@@ -37,24 +41,31 @@ def untrained(config: RunConfig) -> QNetwork:
     return network
 
 
-def deciders(folder: Path, robot: torch.nn.Module, states: Sensed) -> dict:
+def one_by_one(decide: Callable[[Any], object], inputs: list) -> Callable[[], Timed]:
+    """The median time of a single decision, which a busy machine leaves alone."""
+
+    def timed() -> Timed:
+        seconds = []
+        for one in inputs:
+            start_s = time.perf_counter()
+            decide(one)
+            seconds.append(time.perf_counter() - start_s)
+        return Timed(1, statistics.median(seconds))
+
+    return timed
+
+
+def deciders(folder: Path, robot: torch.nn.Module, states: Sensed) -> dict[str, Callable[[], Timed]]:
     """Rivals that decide for one robot at a time, state after state."""
     session, program = onnx_session(folder / ONNX), torch.export.load(folder / PROGRAM).module()
     singles = [{name: array[i : i + 1] for name, array in states.inputs.items()} for i in range(DECISIONS)]
     tensors = [tuple(torch.from_numpy(np.ascontiguousarray(array)) for array in one.values()) for one in singles]
 
-    def by_onnxruntime() -> int:
-        for one in singles:
-            session.run(["velocity"], one)
-        return len(singles)
-
-    def by_torch(module: torch.nn.Module) -> int:
-        with torch.no_grad():
-            for one in tensors:
-                module(*one)
-        return len(tensors)
-
-    return {"onnx": by_onnxruntime, "program": lambda: by_torch(program), "eager": lambda: by_torch(robot)}
+    return {
+        "onnx": one_by_one(lambda one: session.run(["velocity"], one), singles),
+        "program": one_by_one(torch.no_grad()(lambda one: program(*one)), tensors),
+        "eager": one_by_one(torch.no_grad()(lambda one: robot(*one)), tensors),
+    }
 
 
 def measure(method: str, robots: int, groups: int) -> tuple[dict[str, Agreement], dict[str, list[float]], int]:
@@ -66,7 +77,7 @@ def measure(method: str, robots: int, groups: int) -> tuple[dict[str, Agreement]
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "export"
         found = write_export(out, robot, robot_inputs(world), robot_outputs(world), {}, states)
-        speeds = rates(deciders(out, robot, states), ROUNDS)
+        speeds = timed_rates(deciders(out, robot, states), ROUNDS)
     return found, speeds, len(set(states.expected["action"]))
 
 
@@ -76,7 +87,7 @@ def main() -> None:
     answers = Table(title=title)
     for column in ("setup", "file", "actions", "decided otherwise", "observation", "action values", "velocity"):
         answers.add_column(column, justify="right")
-    times = Table(title=f"us a decision of one robot, one thread, median (lowest … highest) of {ROUNDS}")
+    times = Table(title=f"us a decision of one robot, one thread: median of {DECISIONS}, of {ROUNDS} rounds (range)")
     for column in ("setup", "onnxruntime", "ExportedProgram", "eager torch", "eager / onnxruntime"):
         times.add_column(column, justify="right")
     for method, robots, groups in SETUPS:
