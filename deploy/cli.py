@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import sys
 import tomllib
@@ -15,15 +16,30 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import tyro  # noqa: E402
 
 from actors.faults import RunFailed  # noqa: E402
-from deploy.options import Chaos, Command, Evaluate, Report, Resume, Sweep, Train, Watch  # noqa: E402
+from deploy.options import (  # noqa: E402
+    Chaos,
+    Command,
+    Evaluate,
+    Export,
+    Report,
+    Resume,
+    Submit,
+    Sweep,
+    Train,
+    Watch,
+    ray_address,
+)
 from learner.config import RunConfig, from_dict  # noqa: E402
 from learner.presets import PresetName, preset_config  # noqa: E402
+from learner.ray_auth import set_auth_mode  # noqa: E402
 from sim_core.checks import ConfigError, require  # noqa: E402
 from sim_core.config import MethodName  # noqa: E402
 
 FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
+JOBS = ("train", "sweep")
+"""What `shoal submit` runs."""
 
 
 def read_config_file(path: Path) -> RunConfig:
@@ -73,6 +89,7 @@ def parse(arguments: Sequence[str]) -> Command:
       ConfigError: a value cannot work.
       SystemExit: help was asked for (0), or a flag is unknown or malformed (2, after a message).
     """
+    arguments, job = _without_job(arguments)
     default = _train_defaults(arguments) if arguments and arguments[0] == "train" else Train()
     commands: Any = (
         Annotated[Train, tyro.conf.subcommand("train", default=default)]
@@ -82,6 +99,8 @@ def parse(arguments: Sequence[str]) -> Command:
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
         | Annotated[Watch, tyro.conf.subcommand("watch")]
         | Annotated[Chaos, tyro.conf.subcommand("chaos")]
+        | Annotated[Export, tyro.conf.subcommand("export")]
+        | Annotated[Submit, tyro.conf.subcommand("submit")]
     )
     options = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagConversionOff)
     command: Command = tyro.cli(
@@ -89,13 +108,34 @@ def parse(arguments: Sequence[str]) -> Command:
         prog="shoal",
         args=list(arguments),
         config=options,
-        description="Teach one robot to move with its swarm: train, sweep, report, resume, evaluate, watch, and chaos.",
+        description="Teach one robot to move with its swarm.",
     )
+    if isinstance(command, Submit):
+        require(bool(job), f"`shoal submit` needs a command to run: {' or '.join(JOBS)}, with its arguments")
+        command = dataclasses.replace(command, command=tuple(job))
+        parse(job)  # refuses here what the job would refuse
     return command
+
+
+def _without_job(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The arguments of `shoal submit` and, apart, the command that it is to run; of other commands all and none."""
+    words = list(arguments)
+    begin = next((i for i, word in enumerate(words) if word in JOBS), len(words)) if words[:1] == ["submit"] else None
+    return words[:begin], [] if begin is None else words[begin:]
+
+
+def _joins_cluster(command: Command) -> bool:
+    """Whether the command speaks to a Ray cluster that is there already."""
+    if isinstance(command, Train | Sweep):
+        return command.launch.ray_address() is not None
+    return isinstance(command, Submit) or (
+        isinstance(command, Resume | Evaluate) and ray_address(command.address) is not None
+    )
 
 
 def execute(command: Command) -> int:
     """Runs a command; returns its exit code. Imports are late: help must not wait for Ray and MLflow."""
+    set_auth_mode(_joins_cluster(command))  # which Ray reads when it is imported
     if isinstance(command, Train | Resume):
         from deploy import training
 
@@ -104,6 +144,10 @@ def execute(command: Command) -> int:
         from deploy.sweep import sweep
 
         return sweep(command)
+    if isinstance(command, Submit):
+        from deploy.submit import submit
+
+        return submit(command, cast("Train | Sweep", parse(command.command)))
     if isinstance(command, Report):
         from deploy.report import report
 
@@ -112,6 +156,10 @@ def execute(command: Command) -> int:
         from deploy.chaos import chaos
 
         return chaos(command)
+    if isinstance(command, Export):
+        from deploy.export import export
+
+        return export(command)
     from deploy import playing
 
     return playing.evaluate(command) if isinstance(command, Evaluate) else playing.watch(command)

@@ -7,6 +7,17 @@ from pathlib import Path
 
 from sim_core.checks import ConfigError, require
 
+JOB = "RAY_JOB_CONFIG_JSON_ENV_VAR"
+"""Ray sets it for the command of a submitted job."""
+
+
+def check_lasting(runs_dir: Path) -> None:
+    """Raises ConfigError where `--runs-dir` lies in the copy of its folder that a Ray job runs in."""
+    require(
+        runs_dir.is_absolute() or JOB not in os.environ,
+        f"a Ray job runs in a copy of its folder, where --runs-dir {runs_dir} would be lost; name an absolute path",
+    )
+
 
 def make_folder(path: Path, flag: str) -> None:
     """Makes the folder that a flag names, if it is missing.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, Suppress
 
 from learner.config import RunConfig
 from learner.place import DEADLINE_S, START_DEADLINE_S, Place
@@ -80,6 +80,8 @@ class Train:
     """TOML file with settings; flags override it. World settings stand under [world]."""
     preset: PresetName | None = None
     """Named settings of --method in place of the defaults, those of `shoal sweep`; flags override them."""
+    or_resume: bool = False
+    """Go on with the run of this --name where it is there, which must have the same settings; needs --name."""
     run: RunConfig = field(default_factory=RunConfig)
     """What to learn."""
     launch: Launch = field(default_factory=Launch)
@@ -230,4 +232,49 @@ class Chaos:
         require(self.limit_s > 0, f"--limit-s must be greater than 0, not {self.limit_s}")
 
 
-Command = Chaos | Train | Sweep | Report | Resume | Evaluate | Watch
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a policy as ONNX and as a torch ExportedProgram, checked against the simulator."""
+
+    run: Positional[str]
+    """Name of the run, or its folder; or one of its checkpoints, or a policy.safetensors in its folder."""
+    bare: bool = False
+    """Observation to action values alone, for any environment; else from what a robot senses to its velocity."""
+    out: Path | None = None
+    """Folder to write, replaced if it is there; `export` or `export-bare` in the run's artifacts by default."""
+    states: int = 10_000
+    """States of rollouts in which both files must answer as the simulator and its policy do."""
+    first_seed: int = 2_000_000_000
+    """Seed of the first episode of these rollouts; the others count on."""
+    runs_dir: Path = Path("runs")
+    """Folder of all runs."""
+
+    def __post_init__(self) -> None:
+        require(1 <= self.states <= 1_000_000, f"--states must be in 1..1000000, not {self.states}")
+        require(0 <= self.first_seed < 2**31, f"--first-seed must be in 0..{2**31 - 1}, not {self.first_seed}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Submit:
+    """Run `shoal train ...` or `shoal sweep ...` as a job of a Ray cluster, and follow its log.
+
+    The command and its arguments come last, as they would stand after `shoal`. Ctrl-C stops the job, which saves a
+    checkpoint; the same `shoal submit` again goes on with it, or follows it where it still runs.
+    """
+
+    address: str | None = None
+    """The cluster's dashboard; RAY_API_SERVER_ADDRESS, or http://127.0.0.1:8265 by default."""
+    working_dir: Path = Path(".")
+    """A checkout of shoal, which the job runs; what its .gitignore names is not uploaded."""
+    stop_wait_s: int = 120
+    """Time that a stopped job has to save a checkpoint before it is killed."""
+    follow: bool = True
+    """Follow the job's log until it has ended; else return once it is submitted."""
+    command: Suppress[tuple[str, ...]] = ()
+    """The job's command, `train` or `sweep`, with its arguments."""
+
+    def __post_init__(self) -> None:
+        require(self.stop_wait_s >= 1, f"--stop-wait-s must be at least 1, not {self.stop_wait_s}")
+
+
+Command = Train | Sweep | Report | Resume | Evaluate | Watch | Chaos | Export | Submit

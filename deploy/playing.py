@@ -43,7 +43,12 @@ class Entry(NamedTuple):
     title: str
 
 
-def _load(folder: RunFolder, config: RunConfig) -> WeightsSnapshot:
+def load_policy(folder: RunFolder, config: RunConfig) -> WeightsSnapshot:
+    """A run's policy: that of its newest usable checkpoint, or the one that a sweep's cell has kept.
+
+    Raises:
+      CheckpointError: there is none, or it does not fit the config.
+    """
     shape = env_shape(config.env)
     is_swept = folder.results.is_file() or not folder.checkpoints.exists()
     if folder.policy.is_file() and is_swept:  # of a cell that is done, only the policy is kept
@@ -94,7 +99,7 @@ def _run_entry(command: Evaluate) -> Entry:
         f"--robots and --groups apply to our own environment, not to {config.env_id}",
     )
     config = dataclasses.replace(config, world=_on_setup(config.world, command))
-    weights = _load(folder, config)
+    weights = load_policy(folder, config)
     title = f"{config.world.method} {config.world.setup}" if config.env.is_swarm else config.env_id
     return Entry(config.env, weights, folder.path.name, weights.version, title)
 
@@ -131,7 +136,7 @@ def watch(command: Watch) -> int:
     """Renders an episode; returns the exit code."""
     folder = find_run(command.run, command.runs_dir)
     config = folder.config()
-    weights = _load(folder, config)
+    weights = load_policy(folder, config)
     path = command.out or folder.artifacts / f"episode-{command.seed}.{command.format}"
     path.parent.mkdir(parents=True, exist_ok=True)
     if config.env.is_swarm:

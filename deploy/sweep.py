@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.console import Console
 
 from actors.result_table import ResultRow, read_table, write_table
-from deploy.folders import check_plain_name, make_folder
+from deploy.folders import check_lasting, check_plain_name, make_folder
 from deploy.options import Sweep
 from deploy.sweep_board import SweepBoard, make_board
 from learner.config import to_dict
@@ -128,9 +128,15 @@ class _Listener:
         self._board.failed(key, reason)
 
 
+def sweep_name(command: Sweep) -> str:
+    """Name of the sweep's folder: the given one, or what its preset and settings say."""
+    return command.launch.name or re.sub(r"[^\w.+=-]+", "-", command.grid.label)
+
+
 def sweep(command: Sweep) -> int:
     """Runs what is missing of a sweep and writes its table of results; returns the exit code."""
-    launch, name = command.launch, command.launch.name or re.sub(r"[^\w.+=-]+", "-", command.grid.label)
+    launch, name = command.launch, sweep_name(command)
+    check_lasting(launch.runs_dir)
     check_plain_name(name)
     folder = (launch.runs_dir / "sweeps" / name).absolute()
     results = SweepResults(command.grid, folder, read_table(command.known) if command.known else [])

@@ -12,12 +12,12 @@ from rich.console import Console
 from actors.baselines import Baseline
 from actors.vector_env import env_shape
 from deploy.artifacts import log_artifacts
-from deploy.folders import check_plain_name, make_folder
+from deploy.folders import check_lasting, check_plain_name, make_folder
 from deploy.options import Launch, Resume, Train
 from deploy.progress import make_display
 from deploy.tables import evaluation_table, summary_lines
-from learner.checkpoint import Checkpoint
-from learner.config import RunConfig
+from learner.checkpoint import PREFIX, Checkpoint
+from learner.config import RunConfig, config_hash
 from learner.journal import Row
 from learner.learner import learning_device
 from learner.place import Place
@@ -27,12 +27,16 @@ from learner.tracker import Tracker
 from sim_core.checks import require
 
 
-def _new_folder(config: RunConfig, launch: Launch) -> RunFolder:
+def run_base(config: RunConfig) -> str:
+    """What names of runs with `config` begin with."""
+    return config.name.replace("×", "").replace(" ", "-").replace("/", "-")
+
+
+def _new_folder(config: RunConfig, launch: Launch, or_resume: bool) -> RunFolder:
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    base = config.name.replace("×", "").replace(" ", "-").replace("/", "-")
-    folder = launch.runs_dir / (launch.name or f"{base}-{stamp}")
+    folder = launch.runs_dir / (launch.name or f"{run_base(config)}-{stamp}")
     require(
-        not folder.exists(),
+        or_resume or not folder.exists(),
         f"{folder} exists already; choose another --name, or go on with `shoal resume {folder.name}`",
     )
     return RunFolder(folder)
@@ -41,10 +45,16 @@ def _new_folder(config: RunConfig, launch: Launch) -> RunFolder:
 def train(command: Train) -> int:
     """Starts a run; returns the exit code."""
     config, launch = command.run, command.launch
+    check_lasting(launch.runs_dir)
     if launch.name is not None:
         check_plain_name(launch.name)
         require(launch.name not in list(Baseline), f"--name {launch.name} is that of a baseline; choose another")
-    folder = _new_folder(config, launch)
+    if command.or_resume:
+        require(launch.name is not None, "--or-resume needs --name, the run to go on with")
+    folder = _new_folder(config, launch, command.or_resume)
+    if folder.has_begun():
+        with folder.hold():
+            return _go_on(folder, config, launch.place())
     make_folder(launch.runs_dir, "--runs-dir")
     env_shape(config.env)  # refuses an environment that cannot be made
     _check_device(config, launch.place().address)
@@ -60,23 +70,51 @@ def resume(command: Resume) -> int:
     """Goes on with a run; returns the exit code."""
     folder = find_run(command.run, command.runs_dir)
     with folder.hold():
-        return _resume(folder, command)
+        config = folder.config()
+        checkpoint, skipped = resume_point(folder, config)
+        config = _extended(config, command.total_env_steps, checkpoint.state["env_steps"])
+        config = dataclasses.replace(config, device=command.device or config.device)
+        tracker = _tracker(folder.identity())
+        _say_where(checkpoint, skipped)
+        return _resumed(folder, config, tracker, checkpoint, command.place())
 
 
-def _resume(folder: RunFolder, command: Resume) -> int:
-    config, identity = folder.config(), folder.identity()
-    checkpoint, skipped = resume_point(folder, config)
-    config = _extended(config, command.total_env_steps, checkpoint.state["env_steps"])
-    config = dataclasses.replace(config, device=command.device or config.device)
-    _check_device(config, command.place().address)
-    tracker = Tracker(identity.tracking_uri, identity.experiment, None)
-    tracker.resume(identity.mlflow_run_id)
-    folder.save_config(config)
-    console = Console()
+def _go_on(folder: RunFolder, config: RunConfig, place: Place) -> int:
+    """Goes on with a run that is not finished, from its start if it has no checkpoint; returns the exit code."""
+    known = folder.config()
+    require(
+        config_hash(known) == config_hash(config),
+        f"{folder.path} holds a run of other settings; choose another --name",
+    )
+    identity = folder.identity()
+    tracker = _tracker(identity)
+    if config.total_env_steps <= known.total_env_steps and tracker.is_finished(identity.mlflow_run_id):
+        Console().print(f"run {folder.path} has finished before", highlight=False, soft_wrap=True)
+        return 0
+    checkpoint = None
+    if any(path.suffix != ".part" for path in folder.checkpoints.glob(f"{PREFIX}*")):
+        checkpoint, skipped = resume_point(folder, config)
+        _say_where(checkpoint, skipped)
+    return _resumed(folder, config, tracker, checkpoint, place)
+
+
+def _tracker(identity: RunIdentity) -> Tracker:
+    return Tracker(identity.tracking_uri, identity.experiment, None)
+
+
+def _say_where(checkpoint: Checkpoint, skipped: list[str]) -> None:
     for reason in skipped:
-        console.print(f"skipped: {reason}", highlight=False)
-    console.print(f"going on from {checkpoint.folder}", highlight=False, soft_wrap=True)
-    return _run(folder, config, tracker, checkpoint, command.place())
+        Console().print(f"skipped: {reason}", highlight=False)
+    Console().print(f"going on from {checkpoint.folder}", highlight=False, soft_wrap=True)
+
+
+def _resumed(
+    folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, place: Place
+) -> int:
+    _check_device(config, place.address)
+    tracker.resume(folder.identity().mlflow_run_id)
+    folder.save_config(config)
+    return _run(folder, config, tracker, checkpoint, place)
 
 
 def _check_device(config: RunConfig, address: str | None) -> None:

@@ -37,6 +37,7 @@ from learner.cluster import Cluster, learner_settings, rollout_settings, shard_s
 from learner.config import RunConfig
 from learner.node import LearnerNode
 from learner.place import DEADLINE_S, Place
+from learner.ray_auth import HOW, set_auth_mode
 from sim_core.checks import ConfigError, require
 
 PUSHES_IN_FLIGHT = 1
@@ -173,7 +174,7 @@ def connect(cpus: int, address: str | None) -> None:
     """
     if ray.is_initialized():
         return  # an earlier attempt of this run has joined
-    os.environ.setdefault("RAY_AUTH_MODE", "disabled" if address is None else "token")
+    set_auth_mode(address is not None)
     os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # of calls to parts that have been replaced
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     options: dict[str, Any] = {"address": address}
@@ -183,8 +184,7 @@ def connect(cpus: int, address: str | None) -> None:
         ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
     except (ConnectionError, AuthenticationError) as error:
         raise ConfigError(
-            f"no Ray cluster answers at {address!r} with this token; start one with `ray start --head`, and give this "
-            "process the cluster's token (RAY_AUTH_TOKEN, RAY_AUTH_TOKEN_PATH or ~/.ray/auth_token)"
+            f"no Ray cluster answers at {address!r}; start one with `ray start --head`, or for one with tokens {HOW}"
         ) from error
     have = cluster_cpus()
     if have < cpus:

@@ -39,6 +39,11 @@ class RunFolder:
         self.artifacts = self.path / "artifacts"
         self.policy = self.path / "policy.safetensors"
         self.results = self.path / "results.csv"
+        self._identity = self.path / "run.json"
+
+    def has_begun(self) -> bool:
+        """Whether a run has been started here, so far that it can go on."""
+        return self._identity.is_file()
 
     @contextmanager
     def hold(self) -> Iterator[None]:
@@ -69,7 +74,7 @@ class RunFolder:
 
     def save_identity(self, identity: RunIdentity) -> None:
         """Writes `run.json`."""
-        write_json(self.path / "run.json", identity._asdict())
+        write_json(self._identity, identity._asdict())
 
     def identity(self) -> RunIdentity:
         """Reads `run.json`.
@@ -77,11 +82,11 @@ class RunFolder:
         Raises:
           ConfigError: the file is missing or no run's.
         """
-        values = _read(self.path / "run.json")
+        values = _read(self._identity)
         try:
             return RunIdentity(**values)
         except TypeError as error:
-            raise ConfigError(f"{self.path / 'run.json'} does not name a run; train anew") from error
+            raise ConfigError(f"{self._identity} does not name a run; train anew") from error
 
 
 def find_run(name: str, runs_dir: Path) -> RunFolder:

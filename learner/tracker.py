@@ -133,6 +133,13 @@ class Tracker:
         )
         return found[0].info.run_id if found else None
 
+    def is_finished(self, run_id: str) -> bool:
+        """Whether the store knows a run as finished."""
+        try:
+            return bool(self._client.get_run(run_id).info.status == "FINISHED")
+        except MlflowException:
+            return False
+
     def resume(self, run_id: str) -> None:
         """Continues an existing run.
 
@@ -214,8 +221,14 @@ class Tracker:
         self._client.set_terminated(self.run_id, status)
 
 
+COMMIT = "SHOAL_COMMIT"
+"""Names the commit where the code is a copy without its history, as in a submitted job."""
+
+
 def git_commit() -> str:
-    """The commit of the checkout that this module lies in; `unknown` outside one."""
+    """The commit of the checkout that this module lies in, or the one that SHOAL_COMMIT names; else `unknown`."""
+    if os.environ.get(COMMIT):
+        return os.environ[COMMIT]
     here = Path(__file__).parent
     done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False)
     return done.stdout.strip() or "unknown"

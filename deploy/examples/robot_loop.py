@@ -1,0 +1,60 @@
+"""A robot's control loop around a policy that `shoal export` wrote; needs numpy and onnxruntime, nothing of shoal.
+
+    python deploy/examples/robot_loop.py runs/RUN/artifacts/export
+
+Here the groups walk straight to their goals and the robot follows its own. On a real robot, positions come from its
+sensors and its teammates, the velocity goes to its drives, and the loop waits for the next tick.
+"""
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+
+
+def load(folder: Path) -> tuple[Any, dict[str, Any]]:
+    """The policy and what it says of itself; ends the program if it does not answer as where it was trained."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    policy = onnxruntime.InferenceSession(str(folder / "policy.onnx"), options, providers=["CPUExecutionProvider"])
+    golden = np.load(folder / "golden.npz")
+    states = {name.removeprefix("in."): golden[name] for name in golden.files if name.startswith("in.")}
+    if not np.allclose(policy.run(["action_values"], states)[0], golden["out.action_values"], atol=1e-3):
+        sys.exit(f"{folder} does not answer as it should on this machine")
+    return policy, json.loads((folder / "policy.json").read_text("utf-8"))
+
+
+def sense(method: str, robot: Any, groups: Any, goals: Any) -> dict[str, Any]:
+    """What the robot senses, as a batch of one: all positions relative to it, its own group first, without it."""
+    positions = (groups - robot)[None].astype(np.float32)  # [1, groups, robots, 2]
+    mask = np.ones(positions.shape[:3], bool)  # False where a robot is not seen
+    if method != "sensor":
+        return {"positions": positions, "mask": mask, "goals": (goals - robot)[None].astype(np.float32)}
+    other, other_mask = positions[:, 1:].reshape(1, -1, 2), mask[:, 1:].reshape(1, -1)
+    return {"own": positions[:, 0], "own_mask": mask[:, 0], "other": other, "other_mask": other_mask}
+
+
+def main(folder: Path, seconds: float = 12.0, walk_m_s: float = 0.5) -> None:
+    """Runs the loop; prints where the robot is once a second."""
+    policy, about = load(folder)
+    tick_s, count = about["time_step_s"], about["settings"]["world"]["groups"]
+    starts = 6.0 * np.stack([turn(np.arange(count) * 2 * np.pi / count) for turn in (np.cos, np.sin)], axis=1)
+    groups = starts[:, None] + np.random.default_rng(0).uniform(-0.7, 0.7, (count, 6, 2))
+    robot, goals, spent_s = starts[0].copy(), -starts, 0.0
+    for tick in range(round(seconds / tick_s)):
+        begin_s = time.perf_counter()
+        (velocity,) = policy.run(["velocity"], sense(about["method"], robot, groups, goals))
+        spent_s += time.perf_counter() - begin_s
+        robot += velocity[0] * tick_s
+        groups += walk_m_s * tick_s * (goals / np.linalg.norm(goals, axis=1, keepdims=True))[:, None]
+        if tick % round(1 / tick_s) == 0:
+            away_m = np.linalg.norm(robot - groups[0].mean(axis=0))
+            print(f"{tick * tick_s:.0f} s: drives {velocity[0].round(2)} m/s, {away_m:.2f} m from its group")
+    print(f"{1e6 * spent_s / (tick + 1):.0f} us a decision")
+
+
+main(Path(sys.argv[1]))
