@@ -55,9 +55,9 @@ class GreedySensorPlayer:
         self._separate = config.sensor_counts == "separate"
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.int64]:
-        """Actions `[batch]` for counts `[batch, 2q]`, or `[batch, 4q]` apart; a goal's sector after them is ignored."""
+        """Actions `[batch]` for counts `[batch, 2q]`, or `[batch, 4q]` where they are apart."""
         counts = observation.astype(np.int64)
-        own, others = counts[:, : self._cells], counts[:, self._cells : 2 * self._cells]
+        own, others = counts[:, : self._cells], counts[:, self._cells :]
         inner, ring = np.split(own - others if self._separate else own, 2, axis=1)
         size = 2 * np.abs(ring).max(initial=0) + 1  # more than two rings can differ by
         return np.asarray(np.argmax(size * (inner + ring) + ring, axis=1), np.int64)

@@ -67,7 +67,7 @@ class _Parts(NamedTuple):
 
 def _parts(command: Export, config: RunConfig, weights: WeightsSnapshot) -> _Parts:
     shape = env_shape(config.env)
-    network = QNetwork(shape.observation_size, config.hidden_sizes, shape.num_actions)
+    network = QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions)
     load_snapshot(network, weights)
     if command.bare:
         states = observed_states(config.env, weights, command.first_seed, command.states)

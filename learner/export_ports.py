@@ -71,8 +71,9 @@ def robot_inputs(config: WorldConfig) -> list[Port]:
 
 def _observation_meaning(config: WorldConfig) -> str:
     if config.method == "sensor":
+        what = "own, then other robots" if config.sensor_counts == "separate" else "own less other robots"
         return (
-            f"own less other robots in {config.sectors} sectors from angle -pi on, counterclockwise: "
+            f"{what} in {config.sectors} sectors from angle -pi on, counterclockwise: "
             f"nearer than {config.inner_radius_m} m, then up to {config.outer_radius_m} m"
         )
     columns = "a, b, x_c, y_c, theta, x_g, y_g, u_apf_x, u_apf_y".split(", ")

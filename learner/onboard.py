@@ -68,6 +68,7 @@ class SensorRobot(nn.Module):
         super().__init__()
         self.network = network
         self.sectors = config.sectors
+        self.separate = config.sensor_counts == "separate"
         radii = torch.tensor([config.inner_radius_m, config.outer_radius_m], dtype=torch.float32)
         self.register_buffer("radii_sq", radii * radii)
         self.register_buffer("edges", torch.from_numpy(sector_edges(config.sectors)))
@@ -101,7 +102,8 @@ class SensorRobot(nn.Module):
           other: relative positions `[batch, other robots, 2]` float32 of robots of other groups.
           other_mask: `[batch, other robots]` bool.
         """
-        counts = self._counts(own, own_mask) - self._counts(other, other_mask)
+        mates, others = self._counts(own, own_mask), self._counts(other, other_mask)
+        counts = torch.cat([mates, others], dim=1) if self.separate else mates - others
         observation = counts.clamp(-COUNT_LIMIT, COUNT_LIMIT)
         values = self.network(observation)
         action = values.argmax(1)

@@ -56,8 +56,8 @@ def _read(path: Path, updates: int, network: QNetwork | DuelingNetwork) -> Weigh
     except (RuntimeError, OSError, SafetensorError) as error:
         raise CheckpointError(
             f"the policy of {path.parent} takes other observations or actions than this setup: name a run whose "
-            "hidden_sizes, network, sectors, stop_action, sensor_counts and goal_in_state (for M_IN and M_OUT also "
-            "method and groups) are those of its config"
+            "hidden_sizes, network, sectors, stop_action and sensor_counts (for M_IN and M_OUT also method and groups) "
+            "are those of its config"
         ) from error
     return snapshot(network, updates, 0.0)
 

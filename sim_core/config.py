@@ -54,8 +54,6 @@ class WorldConfig:
     """What the step reward tau/eta divides by: the current step (3.2.3) or the horizon (Table 3.2)."""
     sensor_counts: Literal["difference", "separate"] = "difference"
     """`sensor`: own-group less other-group robots a cell (3.2.1), or both counts apart (ours)."""
-    goal_in_state: bool = False
-    """`sensor`: also tells the sector in which the goal lies, as q zeros and ones (ours)."""
 
     outside_limit_steps: int = 100
     """`in`, `out`: phi, env steps outside the own ellipse, one after the other, that fail (not given in the text)."""

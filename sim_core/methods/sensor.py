@@ -2,8 +2,8 @@
 
 Two sensing regions, the disc of radius R1 and the ring from R1 to R2, are cut into q sectors
 (Figure 3.1). The state is, per region and sector, the number of own-group robots less the number of
-other-group robots (3.2.1). Sectors and headings are in the world frame. Settings of ours put the two counts apart
-(`sensor_counts`) and add the goal's sector (`goal_in_state`).
+other-group robots (3.2.1). Sectors and headings are in the world frame. `sensor_counts = separate`, of
+ours, puts the two counts apart.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ class SensorParams(NamedTuple):
     robots: int
     sectors: int
     separate: bool
-    goal_at: int
     inner_sq: Any
     outer_sq: Any
     outer_m: Any
@@ -85,10 +84,6 @@ def _perceive(state, mask, out, edges, params):
             if not group_begin <= other < group_end:
                 cell, step = (cell + 2 * p.sectors, 1) if p.separate else (cell, -1)
             out[world, cell] = min(max(out[world, cell] + step, -COUNT_LIMIT), COUNT_LIMIT)
-        if p.goal_at >= 0:
-            group = learner // p.robots
-            dx, dy = state.goal_x[world, group] - pos_x[learner], state.goal_y[world, group] - pos_y[learner]
-            out[world, p.goal_at + sector_of(dx, dy, edges)] = 1
 
 
 @kernel
@@ -132,8 +127,8 @@ class SensorMethod(Method):
 
     def __init__(self, config: WorldConfig) -> None:
         """Takes its constants from `config`."""
-        counts = 2 * config.sectors * (2 if config.sensor_counts == "separate" else 1)
-        self.observation_shape = (counts + (config.sectors if config.goal_in_state else 0),)
+        separate = config.sensor_counts == "separate"
+        self.observation_shape = ((4 if separate else 2) * config.sectors,)
         self._velocities = heading_velocities(config, np.float32)
         self._edges = sector_edges(config.sectors)
         real = np.float32
@@ -141,8 +136,7 @@ class SensorMethod(Method):
             SensorParams(
                 robots=config.robots,
                 sectors=config.sectors,
-                separate=config.sensor_counts == "separate",
-                goal_at=counts if config.goal_in_state else -1,
+                separate=separate,
                 inner_sq=real(config.inner_radius_m) ** 2,
                 outer_sq=real(config.outer_radius_m) ** 2,
                 outer_m=real(config.outer_radius_m),
@@ -163,10 +157,7 @@ class SensorMethod(Method):
         write_headings(self._velocities, action, out_x, out_y)
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
-        """3.2.1: `[num_worlds, 2q]` counts, the inner disc's q sectors first.
-
-        Apart: 2q counts of own-group, then 2q of other-group robots. The goal's q sectors come last.
-        """
+        """3.2.1: `[num_worlds, 2q]` counts, the inner disc's q first; apart, 2q of the own group, then 2q of others."""
         _perceive(state, mask, out, self._edges, self._params)
 
     def outcome(self, state: WorldState, out: NDArray[np.int8]) -> None:

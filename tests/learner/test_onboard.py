@@ -17,6 +17,7 @@ from sim_core.methods.apf import field_params, repulsion
 NAMES = ("velocity", "action", "action_values", "observation")
 WORLDS = {
     "sensor": WorldConfig(robots=6, groups=3),
+    "sensor, counts apart": WorldConfig(robots=6, groups=3, sensor_counts="separate"),
     "sensor, odd sectors, stop": WorldConfig(robots=6, groups=1, sectors=5, stop_action=True),
     "out": WorldConfig(method="out", robots=6, groups=3),
     "out, itself counted, faster": WorldConfig(

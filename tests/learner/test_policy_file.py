@@ -39,7 +39,7 @@ def test_a_dueling_policy_is_kept_as_the_plain_network_that_it_equals(tmp_path, 
         for array, expected in zip(copy.arrays, weights.arrays, strict=True):
             np.testing.assert_array_equal(array, expected)
     for other in (dataclasses.replace(config, network="plain"), dataclasses.replace(config, hidden_sizes=(9, 16))):
-        with pytest.raises(CheckpointError, match="network and hidden_sizes"):
+        with pytest.raises(CheckpointError, match="hidden_sizes, network"):
             read_policy(read_checkpoint(checkpoint), other, shape)
 
 
@@ -56,7 +56,7 @@ def test_robots_may_differ_but_sectors_may_not(saved, small_run):
     more = RunConfig(world=WorldConfig(robots=9, groups=3, sectors=4), hidden_sizes=(8,))
     read_policy(checkpoint, more, env_shape(more.env))
     for world in (WorldConfig(sectors=5), WorldConfig(sectors=4, stop_action=True)):
-        with pytest.raises(CheckpointError, match="network, sectors, stop_action, sensor_counts"):
+        with pytest.raises(CheckpointError, match="network, sectors, stop_action and sensor_counts"):
             read_policy(checkpoint, small_run, env_shape(small_run.env._replace(world=world)))
 
 

@@ -67,17 +67,6 @@ def test_counts_apart_are_what_the_difference_is_of(sectors, make_state):
         assert (own.sum(), others.sum()) == tuple((dist_sq[part] < 1.5**2).sum() for part in (mates, ~mates))
 
 
-@pytest.mark.parametrize("counts", ["difference", "separate"])
-@pytest.mark.parametrize(("learner", "goal", "sector"), [(0, (3, 1), 2), (0, (-3, -1), 0), (3, (-1, 9), 3)])
-def test_the_goal_is_told_by_its_sector(counts, learner, goal, sector, make_state):
-    config = WorldConfig(robots=3, groups=2, sectors=4, sensor_counts=counts)
-    goals = [goal, (-goal[0], -goal[1])] if learner == 0 else [(-goal[0], -goal[1]), goal]
-    state = make_state(config, np.zeros((6, 2)), goals, learner=learner)
-    told = observe(dataclasses.replace(config, goal_in_state=True), state)
-    assert told[:-4].tolist() == observe(config, state).tolist()
-    assert told[-4:].tolist() == np.eye(4, dtype=int)[sector].tolist()
-
-
 def test_perception_by_hand(make_state):
     config = WorldConfig(robots=3, groups=2, sectors=4)  # sectors start at -180, -90, 0 and 90 degrees
     pos = [(0, 0), (0.3, 0.1), (0.3, 0.2), (-1.0, 0.1), (0.4, 0.1), (0.1, -1.6)]
