@@ -18,6 +18,8 @@ from actors.transitions import Draws, SampleReply
 
 SMALLEST = 1e-6
 """Added to every |TD error| (the paper's epsilon), so that no transition is never drawn again."""
+PRIORITIES = "priorities"
+"""Name of the saved priorities' group."""
 SAVED = np.dtype([("priority", np.float64)])
 """Layout of the saved priorities."""
 
@@ -113,9 +115,10 @@ class PrioritisedShard(ReplayShard):
         return {**super().get_state(), "largest_priority": self._largest, "stale": self._stale}
 
     def save(self, path: Path) -> dict[str, Any]:
-        """As ReplayShard's; the priorities lie in a zarr group beside that of the rows."""
-        save_rows(_beside(path), self.priorities.view(SAVED))
-        return super().save(path)
+        """As ReplayShard's; the priorities lie in a zarr group of their own within that of the rows."""
+        state = super().save(path)
+        save_rows(path / PRIORITIES, self.priorities.view(SAVED))
+        return state
 
     def load(self, path: Path, state: dict[str, Any]) -> None:
         """As ReplayShard's.
@@ -125,13 +128,9 @@ class PrioritisedShard(ReplayShard):
         """
         if "largest_priority" not in state:
             raise ValueError(f"{path} was saved without priorities (replay = uniform)")
-        priorities = load_rows(_beside(path), SAVED)["priority"]
+        priorities = load_rows(path / PRIORITIES, SAVED)["priority"]
         if len(priorities) != state["size"]:
-            raise ValueError(f"{_beside(path)} holds {len(priorities)} priorities for {state['size']} transitions")
+            raise ValueError(f"{path / PRIORITIES} holds {len(priorities)} priorities for {state['size']} transitions")
         super().load(path, state)
         self._tree.load(priorities)
         self._largest, self._stale = state["largest_priority"], state["stale"]
-
-
-def _beside(path: Path) -> Path:
-    return path.with_name(f"{path.stem}-priorities{path.suffix}")

@@ -183,7 +183,7 @@ def test_a_save_that_does_not_fit_is_refused(tmp_path):
         make_shard(17).load(tmp_path / "shard.zarr", state)
     with pytest.raises(ValueError, match="16 priorities for 15"):
         make_shard(16).load(tmp_path / "shard.zarr", {**state, "size": 15})
-    (tmp_path / "shard-priorities.zarr" / "priority" / "c" / "0").unlink()
+    (tmp_path / "shard.zarr" / "priorities" / "priority" / "c" / "0").unlink()
     with pytest.raises(ValueError, match="damaged"):
         make_shard(16).load(tmp_path / "shard.zarr", state)
 

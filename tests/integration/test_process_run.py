@@ -64,9 +64,11 @@ def final_state(folder: Path):
     arrays = {}
     for path in sorted(checkpoint.folder.glob("*.safetensors")):
         arrays |= {f"{path.stem}/{name}": array for name, array in load_file(path).items()}
-    for path in sorted(checkpoint.folder.glob("*.zarr")):
+    for path in sorted([*checkpoint.folder.glob("*.zarr"), *checkpoint.folder.glob("*.zarr/priorities")]):
         root = zarr.open_group(str(path), mode="r")
-        arrays |= {f"{path.stem}/{name}": np.asarray(array[...]) for name, array in root.arrays()}
+        arrays |= {
+            f"{path.relative_to(checkpoint.folder)}/{name}": np.asarray(array[...]) for name, array in root.arrays()
+        }
     state = checkpoint.state
     for name in ("incarnation", "journal_offset", "meters"):
         state.pop(name)
@@ -129,7 +131,7 @@ def test_a_resumed_run_with_every_option_is_the_uninterrupted_one(small, tmp_pat
     train(dataclasses.replace(whole, total_env_steps=3_072), tmp_path / "halves")
     train(whole, tmp_path / "halves")
     halves = final_state(tmp_path / "halves")
-    assert "shard-0-priorities/priority" in halves[0]
+    assert "shard-0.zarr/priorities/priority" in halves[0]
     assert_same(final_state(tmp_path / "whole"), halves)
 
 

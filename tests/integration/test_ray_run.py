@@ -93,7 +93,7 @@ def test_every_transition_is_accounted_for(shoal, tmp_path, replay):
 def assert_priorities_came_back(folder: Path, shards: list) -> None:
     """The learner's answers reached the Ray actors that the rows are in."""
     for i, shard in enumerate(shards):
-        rows = zarr.open_group(str(folder / f"shard-{i}-priorities.zarr"), mode="r")
+        rows = zarr.open_group(str(folder / f"shard-{i}.zarr" / "priorities"), mode="r")
         priorities = np.asarray(rows["priority"][...])
         assert len(priorities) == shard["size"] and 0 < priorities.max() <= shard["largest_priority"]
         assert len(np.unique(priorities)) > 100
