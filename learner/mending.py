@@ -205,6 +205,7 @@ class Mender:
     def _restart_shard(self, part: Part) -> Delivered:
         cluster, index = self._cluster, part.number
         cluster.discard(cluster.targets[index])
+        self._under_way.forget(part)
         incarnation = self._incarnations[part] = self._next_incarnation()
         shard = cluster.targets[index] = cluster.place_shard(index, incarnation)
         self.ask(part, "size")  # others must not wait for it while it starts
