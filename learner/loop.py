@@ -226,8 +226,7 @@ class TrainingLoop:
 
     def _training_row(self) -> dict[str, float]:
         row = self._meters.row(self._ledger.replay_size, self._pacer.ratio()) | self._ledger.row()
-        counts = {"sampled": self._pacer.state.sampled, "updates": self.updates, "restarts": self._mender.restarts}
-        return row | {f"account/{name}": float(count) for name, count in counts.items()}
+        return row | {"account/sampled": float(self._pacer.state.sampled), "account/updates": float(self.updates)}
 
     def _is_due(self, what: str, every: int) -> bool:
         """Whether `env_steps` has passed the next multiple of `every`; moves on to the one after."""
