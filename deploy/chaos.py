@@ -21,7 +21,9 @@ from learner.journal import PushedMark
 from learner.run_folder import RunFolder
 from sim_core.checks import require
 
-POLL_S = 0.2
+POLL_S = 0.1
+LOOK_S = 20.0
+"""How long to look for a victim of the kind that was drawn, such as an evaluation, before another is drawn."""
 DELAY_S = 2.0
 """A delayed process is stopped for so long, which is less than the deadline."""
 OUTAGE_S = 6.0
@@ -77,6 +79,7 @@ class _ChaosRun:
         self._outage: tuple[float, int] | None = None
         self._continue: list[tuple[float, psutil.Process]] = []
         self._setback: set[str] | None = set()
+        self._drawn: tuple[Kind, float] | None = None
 
     def start(self) -> None:
         self.server.start()
@@ -101,8 +104,7 @@ class _ChaosRun:
                 raise TimeoutError(f"no end after {self._command.limit_s:.0f} s:\n{self.driver.tail(30)}")
             self._undo_delays()
             self._mend_server()
-            if code is None and time.monotonic() >= next_s and self._may_hurt():
-                self._hurt()
+            if code is None and time.monotonic() >= next_s and self._may_hurt() and self._hurt():
                 next_s = time.monotonic() + self._rng.uniform(0.5, 1.5) * self._command.every_s
             time.sleep(POLL_S)
         return code
@@ -121,30 +123,41 @@ class _ChaosRun:
         self._setback = None
         return True
 
-    def _hurt(self) -> None:
-        kind = self._rng.choices(KINDS, [kind.weight for kind in KINDS])[0]
-        now_s = time.time()
+    def _draw(self) -> Kind:
+        """The kind that was drawn last and is still looked for, or another."""
+        if self._drawn is None or time.monotonic() > self._drawn[1]:
+            kind = self._rng.choices(KINDS, [kind.weight for kind in KINDS])[0]
+            self._drawn = (kind, time.monotonic() + LOOK_S)
+        return self._drawn[0]
+
+    def _hurt(self) -> bool:
+        """Makes one fault; returns whether there was a victim for it."""
+        kind, now_s = self._draw(), time.time()
         if kind.victim == MLFLOW:
-            if self._outage is None:
-                self.server.kill()
-                self._outage = (now_s, PushedMark.value(self.folder.pushed))
-                self._server_back_s = now_s + OUTAGE_S
-                self._say(kind)
-            return
-        if kind.victim == DRIVER:
-            self._setback = self._checkpoints()
-            self.driver.kill()
+            if self._outage is not None:
+                return False
+            self.server.kill()
+            self._outage = (now_s, PushedMark.value(self.folder.pushed))
+            self._server_back_s = now_s + OUTAGE_S
+            self._say(kind)
+        elif kind.victim == DRIVER:
+            self._kill_driver(kind, now_s)
+        else:
+            victims = self.driver.children(kind.victim)
+            if not victims:
+                return False
+            self._apply(kind, self._rng.choice(victims))
             self._note(kind, now_s)
-            self.server.start_again()  # `shoal resume` needs it
-            self.server.wait()
-            self.driver.start("resume", NAME, *self._flags(False))
-            return
-        victims = self.driver.children(kind.victim)
-        if not victims:
-            return
-        victim = self._rng.choice(victims)
-        self._apply(kind, victim)
+        self._drawn = None
+        return True
+
+    def _kill_driver(self, kind: Kind, now_s: float) -> None:
+        self._setback = self._checkpoints()
+        self.driver.kill()
         self._note(kind, now_s)
+        self.server.start_again()  # `shoal resume` needs it
+        self.server.wait()
+        self.driver.start("resume", NAME, *self._flags(False))
 
     def _apply(self, kind: Kind, victim: psutil.Process) -> None:
         if kind.victim == "learner" and kind.what != "delayed":

@@ -84,16 +84,16 @@ class Delivery:
     def _push(self, rows: list[Row], offset: int) -> bool:
         try:
             self._tracker.push(rows)
-        except TROUBLE as error:
+            with self._changed:
+                if self._closed:
+                    return False
+                self._pushed.write(offset)
+                self._changed.notify_all()
+        except (*TROUBLE, OSError) as error:  # the mark is a file
             if self._refused is None:
                 self._say(f"MLflow does not take the metrics, they are kept and sent again: {first_line(error)}")
             self._refused = first_line(error)
             return False
-        with self._changed:
-            if self._closed:
-                return False
-            self._pushed.write(offset)
-            self._changed.notify_all()
         if self._refused is not None:
             self._say("MLflow takes the metrics again; none is missing")
         self._refused = None

@@ -236,7 +236,6 @@ class TrainingLoop:
             "updates": self.updates,
             "waits_to_insert": pacing.waits_to_insert,
             "waits_to_sample": pacing.waits_to_sample,
-            "restarts": self._mender.restarts,
         }
         return row | {f"{ACCOUNT}{name}": float(count) for name, count in counts.items()}
 

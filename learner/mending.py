@@ -72,8 +72,6 @@ class Mender:
         self._incarnations: dict[Part, int] = {}
         self.highest = cluster.incarnation
         """The highest incarnation so far; the next restart, of whichever part, gets the one after."""
-        self.restarts = 0
-        """Parts that were replaced."""
 
     def incarnation(self, part: Part) -> int:
         """The part's present incarnation: of a shard, 0 for its first in this sitting."""
@@ -170,7 +168,6 @@ class Mender:
             for ref in self._under_way.forget(failure.part):
                 self._cluster.discard(ref)  # it may only be late
             return Delivered()
-        self.restarts += 1
         while True:
             try:
                 if failure.part.kind is PartKind.WORKER:
@@ -205,6 +202,7 @@ class Mender:
     def _restart_shard(self, part: Part) -> Delivered:
         cluster, index = self._cluster, part.number
         cluster.discard(cluster.targets[index])
+        self._under_way.forget(part)
         incarnation = self._incarnations[part] = self._next_incarnation()
         shard = cluster.targets[index] = cluster.place_shard(index, incarnation)
         self.ask(part, "size")  # others must not wait for it while it starts

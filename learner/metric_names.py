@@ -132,7 +132,6 @@ ACCOUNTS = (
     _counter("account/stored", "transitions_stored", "transitions", "stored by replay shards", "grows"),
     _counter("account/dropped", "transitions_dropped", "transitions", "lost with a part, or that came twice", "0"),
     _counter("account/sampled", "transitions_sampled", "transitions", "drawn for updates", "updates x `batch_size`"),
-    _counter("account/restarts", "restarts", "parts", "rollout workers and shards replaced in this sitting", "0"),
 )
 
 HEALTH = (

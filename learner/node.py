@@ -19,6 +19,8 @@ from actors.transitions import AddReply, Delivered, Draws, SampleReply, Transiti
 from learner.double_dqn import importance_weights
 from learner.learner import Learner, LearnerSettings, UpdateStats
 
+SLOW_CALL_S = 3_600.0
+
 
 class UpdateReport(NamedTuple):
     """What a call of updates gives back: their means, the version reached, and a reference to the weights."""
@@ -94,6 +96,11 @@ class LearnerNode:
             part = Part(PartKind.SHARD, index)
             raise PartFailed(part, self._shard_incarnations[index], failure.fault, failure.reason) from failure
 
+    def _slow_result(self, index: int, ref: Ref) -> Any:
+        """`_result` of a call that writes or reads a whole shard; the caller's deadline is for all of them."""
+        self._shard_calls.wait([ref], SLOW_CALL_S)
+        return self._result(index, ref)
+
     def update(self, updates: int, learning_rate: float, importance_exponent: float = 1.0) -> UpdateReport:
         """Samples a super-batch, makes `updates` updates of it, and publishes the weights.
 
@@ -167,7 +174,7 @@ class LearnerNode:
         refs = [
             self._shard_calls.start(shard, "save", folder / f"shard-{i}.zarr") for i, shard in enumerate(self._shards)
         ]
-        shards = [self._result(i, ref) for i, ref in enumerate(refs)]
+        shards = [self._slow_result(i, ref) for i, ref in enumerate(refs)]
         return {"shards": shards, "rng": self._rng.bit_generator.state, "sizes": self._masses.tolist()}
 
     def load(self, folder: Path, state: dict[str, Any]) -> list[Ref]:
@@ -187,7 +194,7 @@ class LearnerNode:
             for i, (shard, shard_state) in enumerate(zip(self._shards, state["shards"], strict=True))
         ]
         for i, ref in enumerate(refs):
-            self._result(i, ref)
+            self._slow_result(i, ref)
         self._rng.bit_generator.state = state["rng"]
         self._answers.clear()
         self._masses[:] = state["sizes"]

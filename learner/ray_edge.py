@@ -46,8 +46,8 @@ COLLECTS_IN_FLIGHT = 2
 """Collects of a worker that are started ahead, so that it never waits for the driver."""
 UPDATES_IN_FLIGHT = 2
 """Calls of updates that are started ahead, so that the learner never waits for the driver."""
-INNER_SHARE = 0.5
-"""Share of the deadline that parts give each other, so that one that waits is not itself late."""
+INNER_SHARE = 0.3
+"""Share of the deadline that parts give each other, so that one that waits, twice in a row, is not itself late."""
 FAULTS: tuple[tuple[tuple[type[Exception], ...], Fault], ...] = (
     ((ActorUnavailableError,), Fault.UNREACHABLE),
     ((RayActorError, WorkerCrashedError, NodeDiedError, OutOfMemoryError, TaskCancelledError), Fault.DIED),

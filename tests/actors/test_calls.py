@@ -21,7 +21,7 @@ def test_calls_run_at_once_and_in_order():
     calls, node = LocalCalls(), Adder()
     refs = [calls.start(node, "add", number) for number in (1, 2, 4)]
     assert node.total == 7
-    assert calls.wait(refs) == refs
+    assert calls.wait(refs, 1.0) == refs
     assert [calls.get(ref) for ref in refs] == [1, 3, 7]
 
 

@@ -29,7 +29,7 @@ def make_worker(make_weights):
 
 
 def assert_same_block(first, second):
-    assert first.header == second.header
+    assert first.header == second.header._replace(made=first.header.made)  # counted from the start of the process
     np.testing.assert_array_equal(first.rows, second.rows)
     for a, b in zip(first.episodes, second.episodes, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -79,9 +79,9 @@ def test_greedy_actions_are_the_policys(swarm, make_worker, make_weights):
 def test_the_header_says_where_a_block_comes_from(swarm, make_worker, make_weights):
     worker = make_worker(swarm)
     first, second = worker.collect(0.25).header, worker.collect(0.125).header
-    expected = (SCHEMA_VERSION, 3, 1, 0, 12, 3.5, 0.25, NUM_ENVS * STEPS)
+    expected = (SCHEMA_VERSION, 3, 1, 0, 12, 3.5, 0.25, NUM_ENVS * STEPS, NUM_ENVS * STEPS)
     assert tuple(first) == expected
-    assert second == first._replace(sequence=1, epsilon=0.125)
+    assert second == first._replace(sequence=1, epsilon=0.125, made=2 * NUM_ENVS * STEPS)
     assert worker.policy_version == 12
     worker.set_weights(make_weights(swarm, version=13, time_s=4.0))
     assert worker.collect(0.0).header[3:6] == (2, 13, 4.0)

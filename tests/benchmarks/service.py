@@ -18,6 +18,7 @@ from learner.config import RunConfig
 from learner.journal import Journal
 from learner.learner import Learner
 from learner.loop import TrainingLoop
+from learner.place import Place
 from learner.ray_edge import ray_cluster
 from tests.benchmarks.timing import rates, ratio, spread
 
@@ -73,7 +74,7 @@ class Silent:
 
 def service_rates(config: RunConfig) -> tuple[float, float]:
     """(env steps/s, updates/s) of the whole service in its steady state."""
-    cluster = ray_cluster(config, 0, None)
+    cluster = ray_cluster(config, 0, Place())
     marks: list[tuple[float, int, int]] = []
     try:
         with tempfile.TemporaryDirectory() as folder, closing(Journal(Path(folder) / "m.jsonl", 0)) as journal:

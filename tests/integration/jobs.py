@@ -28,7 +28,7 @@ class Job:
     def wait_for_files(self, pattern: str, count: int) -> None:
         """Waits until files of `count` different names under the folder have been seen while the job runs."""
         seen: set[Path] = set()
-        deadline_s = time.monotonic() + 120
+        deadline_s = time.monotonic() + 240
         while len(seen) < count:
             assert self.process.poll() is None, self.log.read_text()
             assert time.monotonic() < deadline_s, self.log.read_text()
