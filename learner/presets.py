@@ -11,7 +11,12 @@ the robots' size: those are calibrated on seeds that no evaluation uses (README 
 - M_IN and M_OUT: all robots of a group span its ellipse, as the text has it; the sum u_nn + u_apf may be faster than
   u_nn, as the text bounds neither.
 
-`best` keeps state, actions, reward and worlds of each method and changes only how it is learned.
+`best` plays in the same worlds, with the same actions and ends of episodes, and knows of other robots what the method
+knows. It learns from three steps and more samples, and
+
+- M_sensor counts own and other robots apart: their difference hides a crowd of both;
+- M_IN and M_OUT are rewarded for progress towards the goal inside the ellipse, not for being inside: with few robots
+  the learning robot can hardly leave an ellipse that it spans, and lingers.
 """
 
 from __future__ import annotations
@@ -42,7 +47,15 @@ _TRAINING: dict[tuple[PresetName, MethodName], dict[str, Any]] = {
 }
 _SWARM: dict[str, Any] = {"max_neighbours": 16, "orca_radius_m": 0.18, "robot_radius_m": 0.06}
 _ELLIPSES: dict[str, Any] = {**_SWARM, "ellipse_counts_learner": True, "learner_speed_limit_m_s": 1.5}
-_WORLD: dict[MethodName, dict[str, Any]] = {"sensor": _SWARM, "in": _ELLIPSES, "out": _ELLIPSES}
+_PROGRESS: dict[str, Any] = {**_ELLIPSES, "ellipse_reward": "progress"}
+_WORLD: dict[tuple[PresetName, MethodName], dict[str, Any]] = {
+    ("thesis", "sensor"): _SWARM,
+    ("thesis", "in"): _ELLIPSES,
+    ("thesis", "out"): _ELLIPSES,
+    ("best", "sensor"): {**_SWARM, "sensor_counts": "separate"},
+    ("best", "in"): _PROGRESS,
+    ("best", "out"): _PROGRESS,
+}
 
 
 def preset_config(name: PresetName, method: MethodName, robots: int = 10, groups: int = 2) -> RunConfig:
@@ -51,5 +64,5 @@ def preset_config(name: PresetName, method: MethodName, robots: int = 10, groups
     Raises:
       ConfigError: the setup is not possible.
     """
-    world = WorldConfig(method=method, robots=robots, groups=groups, **_WORLD[method])
+    world = WorldConfig(method=method, robots=robots, groups=groups, **_WORLD[name, method])
     return RunConfig(world=world, **_COMMON, **_TRAINING[name, method])

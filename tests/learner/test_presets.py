@@ -1,9 +1,11 @@
 """The presets: possible in every setup, and what the text says of `thesis`."""
 
+import dataclasses
+
 import pytest
 
+from actors.result_table import GROUPS, ROBOTS
 from learner.presets import preset_config
-from learner.sweep import GROUPS, ROBOTS
 
 
 @pytest.mark.parametrize("name", ["thesis", "best"])
@@ -26,6 +28,9 @@ def test_thesis_has_the_numbers_of_tables_3_2_and_4_2(method):
     assert world.swarm_knows_learner == "method" and config.algorithm == "double_dqn"
 
 
-def test_the_presets_differ():
-    for method in ("sensor", "in", "out"):
-        assert preset_config("thesis", method, 10, 2) != preset_config("best", method, 10, 2)
+@pytest.mark.parametrize(
+    ("method", "ours"), [("sensor", "sensor_counts"), ("in", "ellipse_reward"), ("out", "ellipse_reward")]
+)
+def test_best_changes_state_or_reward_of_a_world_and_nothing_else(method, ours):
+    thesis, best = (dataclasses.asdict(preset_config(name, method, 10, 2).world) for name in ("thesis", "best"))
+    assert [name for name in thesis if thesis[name] != best[name]] == [ours]
