@@ -72,7 +72,8 @@ def test_orca_lines_are_rvo2s(page: Any, episode: Episode):
     compared = 0
     for step in STEPS:
         # The player's own velocities, which are rounded: RVO2 is to judge the lines made of them.
-        script = """const [step, robots] = arguments, rows = read => robots.map(i => [read(step, i, 0), read(step, i, 1)]);
+        script = """const [step, robots] = arguments;
+            const rows = read => robots.map(i => [0, 1].map(axis => read(step, i, axis)));
             return [rows(coordinate), rows(velocityAt)]"""
         position, velocity = np.array(page.execute_script(script, step, known.tolist()), np.float32)
         np.testing.assert_allclose(velocity, episode.velocity[step][known], atol=0.011)
