@@ -14,7 +14,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import tyro  # noqa: E402
 
-from deploy.options import Command, Evaluate, Report, Resume, Sweep, Train, Watch  # noqa: E402
+from deploy.options import Command, Dashboard, Evaluate, Report, Resume, Sweep, Train, Watch  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
 from learner.presets import MethodName, PresetName, preset_config  # noqa: E402
 from sim_core.checks import ConfigError, require  # noqa: E402
@@ -78,6 +78,7 @@ def parse(arguments: Sequence[str]) -> Command:
         | Annotated[Resume, tyro.conf.subcommand("resume")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
         | Annotated[Watch, tyro.conf.subcommand("watch")]
+        | Annotated[Dashboard, tyro.conf.subcommand("dashboard")]
     )
     options = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagConversionOff)
     command: Command = tyro.cli(
@@ -85,7 +86,7 @@ def parse(arguments: Sequence[str]) -> Command:
         prog="shoal",
         args=list(arguments),
         config=options,
-        description="Teach one robot to move with its swarm: train, sweep, report, resume, evaluate and watch.",
+        description="Teach one robot to move with its swarm: train, sweep, report, resume, evaluate, watch and look.",
     )
     return command
 
@@ -104,6 +105,10 @@ def execute(command: Command) -> int:
         from deploy.report import report
 
         return report(command)
+    if isinstance(command, Dashboard):
+        from deploy.dashboard import dashboard
+
+        return dashboard(command)
     from deploy import playing
 
     return playing.evaluate(command) if isinstance(command, Evaluate) else playing.watch(command)
