@@ -5,14 +5,17 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, UseCounterAction, arg
 
 from learner.config import RunConfig
 from learner.presets import PresetName
 from learner.sweep import SweepConfig
 from sim_core.checks import require
+
+Switch = Annotated[UseCounterAction[int], arg(help_behavior_hint="(off by default)")]
+"""A flag without a value: 0 unless it is given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +167,7 @@ class Watch:
     """Seed of the episode."""
     out: Path | None = None
     """File to write; `episode-SEED` in the run's artifacts by default."""
-    live: bool = False
+    live: Switch = 0
     """Look into a running training: a page on 127.0.0.1 that plays the newest checkpoint's policy, again and again."""
     port: int = 8400
     """--live: port of the page; 0 takes a free one."""
@@ -188,7 +191,7 @@ class Dashboard:
     """A sweep (its name, its folder or a results.csv), or a run (its name or its folder)."""
     out: Path | None = None
     """File to write; dashboard.html beside the results by default."""
-    serve: bool = False
+    serve: Switch = 0
     """Serve the report on 127.0.0.1 instead of writing it: it follows a running sweep or run, and plays any episode."""
     port: int = 8400
     """--serve: port of the page; 0 takes a free one."""
@@ -203,7 +206,7 @@ class Dashboard:
         _check_port(self.port)
         require(self.episodes >= 0, f"--episodes must not be negative, not {self.episodes}")
         require(self.episodes_mb >= 0, f"--episodes-mb must not be negative, not {self.episodes_mb}")
-        require(not (self.serve and self.out is not None), "--serve writes no file; leave out --out or --serve")
+        require(not self.serve or self.out is None, "--serve writes no file; leave out --out or --serve")
 
 
 def _check_port(port: int) -> None:
