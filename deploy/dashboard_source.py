@@ -19,7 +19,7 @@ from dashboards.result_charts import NAMED, failure_causes, heatmaps, transfers
 from dashboards.run_charts import Speed, Training, run_curves, run_speeds, setup_curves, sweep_speeds
 from dashboards.web_report import Contents, TablePart
 from deploy.artifacts import curve_points
-from deploy.live import policy_signature
+from deploy.policies import policy_signature
 from deploy.shelves import RecordedShelf, RunShelf, Shelf, Shelves, SweepShelf
 from deploy.sweep import CELLS, RESULTS
 from learner.config import RunConfig

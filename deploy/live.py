@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from actors.evaluator import record_episode
-from actors.network import WeightsSnapshot
 from dashboards.player import player_data, player_page
 from dashboards.server import PageServer
 from dashboards.web_assets import SERVED
-from deploy.policies import newest_policy
+from deploy.policies import NewestPolicy
 from learner.config import RunConfig
 from learner.journal import read_rows
 from learner.run_folder import RunFolder
@@ -20,44 +19,6 @@ from sim_core.checks import ConfigError, require
 
 if TYPE_CHECKING:
     from deploy.options import Watch
-
-
-class NewestPolicy:
-    """The newest policy of a run, read again when there is a newer one.
-
-    Args:
-      folder: the run.
-      config: its config.
-    """
-
-    def __init__(self, folder: RunFolder, config: RunConfig) -> None:
-        self._folder = folder
-        self._config = config
-        self._seen: object = None
-        self._weights: WeightsSnapshot | None = None
-
-    def get(self) -> WeightsSnapshot:
-        """The policy.
-
-        Raises:
-          ConfigError: the run has none yet.
-        """
-        signature = policy_signature(self._folder)
-        if signature != self._seen:
-            try:
-                self._weights, self._seen = newest_policy(self._folder, self._config), signature
-            except ConfigError:
-                if self._weights is None:
-                    raise  # else a checkpoint was being removed: the next call looks again
-        assert self._weights is not None
-        return self._weights
-
-
-def policy_signature(folder: RunFolder) -> tuple[str, ...]:
-    """Changes when a run has another newest policy."""
-    whole = {path.name for path in folder.checkpoints.glob("step-*") if not path.suffix}
-    names = sorted(whole)[-1:]
-    return (*names, str(folder.policy.stat().st_mtime_ns)) if folder.policy.is_file() else tuple(names)
 
 
 class LiveRun:

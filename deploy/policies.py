@@ -1,4 +1,4 @@
-"""The newest policy of a run's folder."""
+"""The newest policy of a run's folder, once or for as long as the run goes on."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from learner.checkpoint import newest_valid
 from learner.config import RunConfig
 from learner.policy_file import read_policy, read_saved_policy
 from learner.run_folder import RunFolder
+from sim_core.checks import ConfigError
 
 
 def newest_policy(folder: RunFolder, config: RunConfig) -> WeightsSnapshot:
@@ -30,3 +31,41 @@ def newest_policy(folder: RunFolder, config: RunConfig) -> WeightsSnapshot:
     for reason in skipped:
         Console(stderr=True).print(f"skipped: {reason}", highlight=False)
     return read_policy(checkpoint, config, shape)
+
+
+class NewestPolicy:
+    """The newest policy of a run, read again when there is a newer one.
+
+    Args:
+      folder: the run.
+      config: its config.
+    """
+
+    def __init__(self, folder: RunFolder, config: RunConfig) -> None:
+        self._folder = folder
+        self._config = config
+        self._seen: object = None
+        self._weights: WeightsSnapshot | None = None
+
+    def get(self) -> WeightsSnapshot:
+        """The policy.
+
+        Raises:
+          ConfigError: the run has none yet.
+        """
+        signature = policy_signature(self._folder)
+        if signature != self._seen:
+            try:
+                self._weights, self._seen = newest_policy(self._folder, self._config), signature
+            except ConfigError:
+                if self._weights is None:
+                    raise  # else a checkpoint was being removed: the next call looks again
+        assert self._weights is not None
+        return self._weights
+
+
+def policy_signature(folder: RunFolder) -> tuple[str, ...]:
+    """Changes when a run has another newest policy."""
+    whole = {path.name for path in folder.checkpoints.glob("step-*") if not path.suffix}
+    names = sorted(whole)[-1:]
+    return (*names, str(folder.policy.stat().st_mtime_ns)) if folder.policy.is_file() else tuple(names)

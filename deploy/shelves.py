@@ -9,14 +9,14 @@ from typing import Any, NamedTuple, Protocol
 from actors.baselines import Baseline
 from actors.evaluation_store import load_evaluation
 from actors.evaluator import Candidate, evaluate, record_episode
+from actors.network import WeightsSnapshot
 from actors.result_table import LEARNED, ResultRow, read_table
 from actors.trajectory import Episode, load_episodes
-from actors.vector_env import EnvSpec
 from dashboards.player import player_data
 from dashboards.pooled import METHOD_NAMES, Setup
 from dashboards.web_assets import to_json
 from dashboards.web_report import EpisodeGroup
-from deploy.policies import newest_policy
+from deploy.policies import NewestPolicy, newest_policy
 from learner.run_folder import RunFolder
 from learner.trial import EVALUATIONS
 from sim_core.checks import ConfigError
@@ -122,35 +122,39 @@ class RunShelf:
     """
 
     def __init__(self, folder: RunFolder) -> None:
-        self._folder = folder
-        self._spec: EnvSpec | None = None
-        self._candidate: Candidate | None = None
+        self._config = folder.config()
+        self._policy = NewestPolicy(folder, self._config)
+        self._weights: WeightsSnapshot | None = None
         self._seeds: dict[str, list[int]] = {}
 
     def groups(self) -> list[EpisodeGroup]:
         """One group, or none while the run has no policy."""
-        config = self._folder.config()
         try:
-            weights = newest_policy(self._folder, config)
+            weights = self._policy.get()
         except ConfigError:
             return []
-        seeds = list(range(config.final_eval_first_seed, config.final_eval_first_seed + RUN_EPISODES))
-        stats = evaluate(config.env, weights, seeds)
-        self._spec, self._candidate = config.env, weights
-        self._seeds = {
-            outcome.name.lower(): [seed for seed, end in zip(seeds, stats.outcome, strict=True) if end == outcome]
+        if weights is not self._weights:
+            self._weights, self._seeds = weights, self._play(weights)
+        world, counts = self._config.world, {name: len(found) for name, found in self._seeds.items()}
+        policy, seed = f"of update {weights.version:,}", str(self._config.seed)
+        return [EpisodeGroup(NEWEST, "", policy, world.method, world.setup, seed, world.setup, counts)]
+
+    def _play(self, weights: WeightsSnapshot) -> dict[str, list[int]]:
+        """Seeds of the episodes by outcome."""
+        first = self._config.final_eval_first_seed
+        seeds = list(range(first, first + RUN_EPISODES))
+        outcomes = evaluate(self._config.env, weights, seeds).outcome
+        return {
+            outcome.name.lower(): [seed for seed, end in zip(seeds, outcomes, strict=True) if end == outcome]
             for outcome in ENDED
         }
-        world, counts = config.world, {name: len(found) for name, found in self._seeds.items()}
-        policy = f"of update {weights.version:,}"
-        return [EpisodeGroup(NEWEST, "", policy, world.method, world.setup, str(config.seed), world.setup, counts)]
 
     def episode(self, key: str, outcome: str, number: int) -> dict[str, Any]:
         """Plays the episode."""
-        if key != NEWEST or self._spec is None or self._candidate is None:
+        if key != NEWEST or self._weights is None:
             raise LookupError(f"group {key!r}")
         seed = _at(self._seeds.get(outcome, []), number)
-        return player_data(record_episode(self._spec, self._candidate, seed), self._spec.world)
+        return player_data(record_episode(self._config.env, self._weights, seed), self._config.world)
 
 
 class RecordedShelf:
