@@ -166,7 +166,7 @@ def sweep_speeds(trainings: Sequence[Training]) -> Chart:
         "Each point is one training, updates included; several may have shared a machine. From the journals' rows. "
         "Both axes are logarithmic."
     )
-    return Chart("speed", "Throughput", note, [], views)
+    return Chart("throughput", "Throughput", note, [], views)
 
 
 def _middle(training: Training) -> float:

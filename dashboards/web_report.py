@@ -23,7 +23,7 @@ from dashboards.web_assets import OFFLINE, PLAYER_CSS, PLAYER_JS, SERVED, assets
 
 REFRESH_S = 4
 """A served page asks for newer data this often."""
-FIRST, LAST = ("running", "success", "claims"), ("transfer", "failures", "curves", "speed")
+FIRST, LAST = ("running", "success", "claims"), ("transfer", "failures", "curves", "throughput")
 """The sections of a report, from top to bottom: tables of other names stand between, the episodes come last."""
 
 

@@ -13,8 +13,9 @@ const episodes = {
     element("episodes").hidden = groups.length === 0;
     element("episodes-note").textContent = note;
     if (!groups.length) return;
-    const favourite = groups.find(group => group.played === content.favourite && group.trained === group.played);
-    if (!this.chosen.method && favourite) this.chosen = {...favourite, number: 0};
+    const playable = groups.filter(group => OUTCOMES.some(outcome => this.available(group, outcome)));
+    const favourite = playable.find(group => group.played === content.favourite && group.trained === group.played);
+    if (!this.chosen.method && playable.length) this.chosen = {...(favourite || playable[0]), number: 0};
     this.show();
   },
 
@@ -40,9 +41,10 @@ const episodes = {
 
   show() {
     const {group, offered} = this.narrow(), counts = OUTCOMES.filter(outcome => group.counts[outcome]);
-    const available = outcome => REFRESH_S > 0 ? group.counts[outcome] : this.sampled(group, outcome);
-    if (!counts.includes(this.chosen.outcome)) this.chosen.outcome = counts.find(available) || counts[0];
-    const have = available(this.chosen.outcome);
+    if (!counts.includes(this.chosen.outcome)) {
+      this.chosen.outcome = counts.find(outcome => this.available(group, outcome)) || counts[0];
+    }
+    const have = this.available(group, this.chosen.outcome);
     this.chosen.number = Math.max(0, Math.min(this.chosen.number || 0, have - 1));
     const set = field => value => {
       this.chosen = {...this.chosen, [field]: value, number: 0};
@@ -58,7 +60,9 @@ const episodes = {
     this.play(group, have);
   },
 
-  sampled(group, outcome) {
+  // How many episodes of an outcome can be played: all where the page is served, else those in the file.
+  available(group, outcome) {
+    if (REFRESH_S > 0) return group.counts[outcome] || 0;
     let count = 0;
     while (`${group.key}|${outcome}|${count}` in this.samples) count++;
     return count;
