@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import threading
 from collections.abc import Callable, Mapping
@@ -67,9 +68,7 @@ class PageServer:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """GET alone; what it answers is in the subclass that the server makes."""
-
-    protocol_version = "HTTP/1.1"
+    """GET alone, a connection a request; what it answers is in the subclass that the server makes."""
 
     def answer(self, path: str, query: Query) -> Any:
         """What a path answers."""
@@ -106,10 +105,8 @@ class _Handler(BaseHTTPRequestHandler):
         for name, value in headers.items():
             self.send_header(name, value)
         self.end_headers()
-        try:
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the reader has gone
             self.wfile.write(body)
-        except (BrokenPipeError, ConnectionResetError):
-            self.close_connection = True  # the reader has gone
 
     def log_message(self, format: str, *args: Any) -> None:
         """Says nothing: a page that refreshes would fill the terminal."""

@@ -47,6 +47,7 @@ const TEMPLATE = {layout: {
 function drawPlot(plot, figure) {
   const style = getComputedStyle(document.documentElement);
   const {data: traces, layout} = coloured({data: figure.data, layout: {...figure.layout, autosize: true, template: TEMPLATE}}, style);
+  plot.style.height = layout.height + "px";  // else a redraw while the page changes its width leaves none
   Plotly.react(plot, traces, layout, {responsive: true, displayModeBar: false});
 }
 

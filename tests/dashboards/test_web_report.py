@@ -87,7 +87,8 @@ def requested(browser: Any) -> set[str]:
 def plots(page: Any, section: str) -> list[dict[str, Any]]:
     script = """return [...document.querySelectorAll(`#${arguments[0]} .plot`)].map(p => ({
         title: p.closest('figure').querySelector('figcaption').textContent,
-        data: JSON.parse(JSON.stringify(p.data)), width: p.clientWidth, drawn: p._fullLayout.width,
+        data: JSON.parse(JSON.stringify(p.data)), drawn: p._fullLayout.width,
+        width: p.clientWidth, height: p.clientHeight,
         texts: [...p.querySelectorAll('.annotation-text')].map(t => t.textContent),
         bars: [...p.querySelectorAll('.trace.bars')].map(t => t.querySelectorAll('.point path').length)}))"""
     return list(page.execute_script(script, section))
@@ -286,12 +287,15 @@ def test_charts_follow_the_scheme(page: Any):
 
 
 def test_it_fits_a_narrow_screen(page: Any):
+    with emulate_scheme(page, "dark"):
+        two_frames(page)
     with emulate_width(page, 340):
         two_frames(page)
         wait_until(page, "document.querySelector('#success .plot')._fullLayout.width < 340")
         width, canvas = page.execute_script("return [document.documentElement.scrollWidth, canvas.clientWidth]")
         for section in ("success", "transfer"):
             assert all(plot["drawn"] == pytest.approx(plot["width"], abs=1) for plot in plots(page, section))
+            assert all(plot["height"] == 300 for plot in plots(page, section))
     assert width <= 340
     assert canvas > 280
 

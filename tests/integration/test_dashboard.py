@@ -172,6 +172,8 @@ def test_a_served_report_follows_the_sweep(browser, sweep, tmp_path):
         assert all(address.startswith(url) for address in requested(browser))
         assert complaints(browser) == []
     wait_until(browser, "element('status').textContent.startsWith('The server does not answer')")
+    browser.get("about:blank")
+    browser.get_log("browser")  # the requests that nobody answered
 
 
 def test_curves_and_speeds_are_the_journals(sweep):
@@ -207,12 +209,13 @@ def test_live_plays_the_newest_policy_and_the_one_after(browser, trained, tmp_pa
         wait_until(browser, f"element('status').dataset.updates === '{early}' && playing")
         said = browser.find_element("id", "status").text
         assert f"Playing the policy of update {early:,}." in said and "of 3,000 env steps" in said
+        wait_until(browser, "playing && (setPlaying(false), true)")  # a pause, until the newer policy is there
         first = browser.execute_script("return data.setup")
         train(tmp_path / "later", 6_000)
         newer = newest_valid(tmp_path / "later" / "checkpoints")[0]
         newer.folder.rename(run.checkpoints / newer.folder.name)
         wait_until(browser, "element('status').textContent.includes('plays next')")
-        browser.execute_script("element('speed').value = '8'; seek(data.steps - 2); if (!playing) setPlaying(true)")
+        browser.execute_script("seek(data.steps - 1); setPlaying(true)")
         wait_until(browser, f"element('status').dataset.updates === '{newer.state['updates']}'")
         assert newer.state["updates"] > early
         assert browser.execute_script("return data.setup") != first  # another seed
