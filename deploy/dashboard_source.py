@@ -118,7 +118,7 @@ class SweepSource:
         return Contents(
             title=self.title,
             subtitle=_sentence(rows, running),
-            made=f"Made by `shoal dashboard` from {self._table.name}. Rates with 95 % intervals.",
+            made=f"Made by `shoal dashboard` from {self._table.name}. Rates with 95 % intervals.{self._lacking()}",
             facts=facts,
             charts=[*charts, *self._training_charts()],
             claims=claims,
@@ -126,6 +126,10 @@ class SweepSource:
             groups=self.shelf.groups(),
             episodes_note=SWEEP_EPISODES,
         )
+
+    def _lacking(self) -> str:
+        is_alone = not self._cells.is_dir()
+        return " Curves, throughput and episodes need the sweep’s folder with its cells." if is_alone else ""
 
     def _training_charts(self) -> list[Chart]:
         folders = [RunFolder(path.parent) for path in sorted(self._cells.glob("*/metrics.jsonl"))]
