@@ -170,7 +170,6 @@ def test_chromium_keys_move_in_time(page: Any, failed: Episode):
 def test_chromium_plays_to_the_end_and_starts_over(page: Any, failed: Episode):
     last = len(failed.action) - 1
     page.execute_script("element('speed').value = '8'; element('play').click()")
-    page.set_script_timeout(20)
     page.execute_async_script("const f = arguments[0]; (function w() { playing ? setTimeout(w, 20) : f(); })()")
     assert read_step(page) == last
     assert page.execute_script("return element('play').textContent") == "Play"
