@@ -58,6 +58,9 @@ class ResultRow(NamedTuple):
         return (self.trained_robots, self.trained_groups) == (self.robots, self.groups)
 
 
+_TYPES: dict[str, Any] = get_type_hints(ResultRow)
+
+
 def write_table(path: Path, rows: Iterable[ResultRow]) -> None:
     """Writes rows in a fixed order to a CSV file; an older one is replaced once the new is whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -88,9 +91,8 @@ def read_table(path: Path) -> list[ResultRow]:
 
 
 def _row(line: list[str], where: str) -> ResultRow:
-    types: dict[str, Any] = get_type_hints(ResultRow)
     try:
-        values = [types[name](text) for name, text in zip(ResultRow._fields, line, strict=True)]
+        values = [_TYPES[name](text) for name, text in zip(ResultRow._fields, line, strict=True)]
     except ValueError as error:
         raise ConfigError(f"{where} is no row of results ({error}); make the table again") from error
     row = ResultRow(*values)

@@ -10,6 +10,8 @@ SHOWN_WHOLE = 5
 """A claim with this many checks or fewer shows all of them in the table."""
 NAMED_AT_MOST = 10
 """This many checks without data, or undecided, are named; more are only counted."""
+DETAILS = ("check", "wanted", "measured (95 % interval)", "seeds", "episodes", "verdict")
+"""Columns of a table of checks."""
 NOTE = """\
 Rates with 95 % intervals: Wilson's on counts pooled over training seeds, Newcombe's and Donner and Zou's for
 differences and means. They speak of the policies that were trained, not of what another training seed would give; the
@@ -68,9 +70,8 @@ def details(claims: Sequence[Claim]) -> list[str]:
     """Every check of every claim with its numbers; as lines."""
     lines: list[str] = []
     for claim in claims:
-        rows = [_detail(check) for check in claim.checks]
-        header = ("check", "wanted", "measured (95 % interval)", "seeds", "episodes", "verdict")
-        lines += [f"### {claim.number}. {claim.text}", "", f"**{claim.verdict}**", "", *table_of(header, rows), ""]
+        rows = [detail_row(check) for check in claim.checks]
+        lines += [f"### {claim.number}. {claim.text}", "", f"**{claim.verdict}**", "", *table_of(DETAILS, rows), ""]
     return lines
 
 
@@ -104,7 +105,8 @@ def _names(checks: Sequence[Check]) -> str:
     return ", ".join(check.name for check in checks)
 
 
-def _detail(check: Check) -> tuple[str, ...]:
+def detail_row(check: Check) -> tuple[str, ...]:
+    """A check in the columns DETAILS."""
     measured = check.measured
     seeds = "–" if measured is None else str(measured.seeds)
     if measured is not None and measured.seed_range is not None:

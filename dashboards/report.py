@@ -86,12 +86,17 @@ def _preset_part(part: PresetPart) -> list[str]:
 
 
 def comparison(rivals: dict[str, Results]) -> list[str]:
-    """Mean Fixed success of each rival over the setups that all have, a row a method; as lines.
+    """`comparison_rows` as the lines of a Markdown table."""
+    return table_of(*comparison_rows(rivals))
+
+
+def comparison_rows(rivals: dict[str, Results]) -> tuple[list[str], list[list[str]]]:
+    """Mean Fixed success of each rival over the setups that all have, a row a method; the header, and the rows.
 
     `best in` counts the setups in which a rival has a higher rate than every other.
     """
     header = ["method", "setups in all", *rivals, *(f"{name} best in" for name in rivals)]
-    return table_of(header, [_comparison_row(list(rivals.values()), method) for method in METHOD_NAMES])
+    return header, [_comparison_row(list(rivals.values()), method) for method in METHOD_NAMES]
 
 
 def _comparison_row(rivals: list[Results], method: str) -> list[str]:

@@ -19,6 +19,7 @@ from actors.faults import RunFailed  # noqa: E402
 from deploy.options import (  # noqa: E402
     Chaos,
     Command,
+    Dashboard,
     Evaluate,
     Export,
     Report,
@@ -101,6 +102,7 @@ def parse(arguments: Sequence[str]) -> Command:
         | Annotated[Chaos, tyro.conf.subcommand("chaos")]
         | Annotated[Export, tyro.conf.subcommand("export")]
         | Annotated[Submit, tyro.conf.subcommand("submit")]
+        | Annotated[Dashboard, tyro.conf.subcommand("dashboard")]
     )
     options = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagConversionOff)
     command: Command = tyro.cli(
@@ -160,6 +162,10 @@ def execute(command: Command) -> int:
         from deploy.export import export
 
         return export(command)
+    if isinstance(command, Dashboard):
+        from deploy.dashboard import dashboard
+
+        return dashboard(command)
     from deploy import playing
 
     return playing.evaluate(command) if isinstance(command, Evaluate) else playing.watch(command)

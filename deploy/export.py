@@ -13,7 +13,7 @@ from actors.network import QNetwork, WeightsSnapshot, load_snapshot
 from actors.vector_env import env_shape
 from deploy.folders import make_folder
 from deploy.options import Export
-from deploy.playing import load_policy
+from deploy.policies import newest_policy
 from learner.checkpoint import MANIFEST, read_checkpoint
 from learner.config import RunConfig, config_hash, to_dict
 from learner.export import Agreement, check_packages, write_export
@@ -53,7 +53,7 @@ def find_source(name: str, runs_dir: Path) -> Source:
         return Source(folder, config, read_policy(read_checkpoint(path), config, env_shape(config.env)))
     folder = find_run(name, runs_dir)
     config = folder.config()
-    return Source(folder, config, load_policy(folder, config))
+    return Source(folder, config, newest_policy(folder, config))
 
 
 class _Parts(NamedTuple):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional, Suppress
+from tyro.conf import Positional, Suppress, UseCounterAction, arg
 
 from learner.config import RunConfig
 from learner.place import DEADLINE_S, START_DEADLINE_S, Place
@@ -15,6 +15,9 @@ from learner.presets import PresetName
 from learner.sweep import SweepConfig
 from sim_core.checks import require
 from sim_core.config import MethodName
+
+Switch = Annotated[UseCounterAction[int], arg(help_behavior_hint="(off by default)")]
+"""A flag without a value: 0 unless it is given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,11 +201,20 @@ class Watch:
     """Seed of the episode."""
     out: Path | None = None
     """File to write; `episode-SEED` in the run's artifacts by default."""
+    live: Switch = 0
+    """Look into a running training: a page on 127.0.0.1 that plays the newest checkpoint's policy, again and again."""
+    port: int = 8400
+    """--live: port of the page; 0 takes a free one."""
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
 
     def __post_init__(self) -> None:
         require(0 <= self.seed < 2**32, f"--seed must be in 0..{2**32 - 1}, not {self.seed}")
+        _check_port(self.port)
+        require(
+            not self.live or (self.format == "html" and self.out is None),
+            "--live plays in a web page and writes no file; leave out --format and --out",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,4 +289,34 @@ class Submit:
         require(self.stop_wait_s >= 1, f"--stop-wait-s must be at least 1, not {self.stop_wait_s}")
 
 
-Command = Train | Sweep | Report | Resume | Evaluate | Watch | Chaos | Export | Submit
+@dataclass(frozen=True, kw_only=True)
+class Dashboard:
+    """Show a sweep or a run as an HTML report with its episodes to play: one file, or a page that follows it live."""
+
+    source: Positional[str]
+    """A sweep (its name, its folder or a results.csv), or a run (its name or its folder)."""
+    out: Path | None = None
+    """File to write; dashboard.html beside the results by default."""
+    serve: Switch = 0
+    """Serve the report on 127.0.0.1 instead of writing it: it follows a running sweep or run, and plays any episode."""
+    port: int = 8400
+    """--serve: port of the page; 0 takes a free one."""
+    episodes: int = 1
+    """Episodes of each policy and outcome that the file takes with it; 0 for none."""
+    episodes_mb: float = 5.0
+    """... as long as all of them together take no more than this many megabytes."""
+    runs_dir: Path = Path("runs")
+    """Folder of all runs and sweeps."""
+
+    def __post_init__(self) -> None:
+        _check_port(self.port)
+        require(self.episodes >= 0, f"--episodes must not be negative, not {self.episodes}")
+        require(self.episodes_mb >= 0, f"--episodes-mb must not be negative, not {self.episodes_mb}")
+        require(not self.serve or self.out is None, "--serve writes no file; leave out --out or --serve")
+
+
+def _check_port(port: int) -> None:
+    require(0 <= port <= 65535, f"--port must be in 0..65535, not {port}")
+
+
+Command = Train | Sweep | Report | Resume | Evaluate | Watch | Dashboard | Chaos | Export | Submit

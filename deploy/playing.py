@@ -14,19 +14,19 @@ from actors.evaluation_store import StoredEvaluation, refuse_existing, save_eval
 from actors.evaluator import Candidate, record_episode
 from actors.network import WeightsSnapshot
 from actors.trajectory import save_episodes
-from actors.vector_env import EnvSpec, env_shape
+from actors.vector_env import EnvSpec
 from dashboards.strip import episode_strip_png
 from deploy.artifacts import foreign_animation, write_player, write_video
 from deploy.folders import make_folder
+from deploy.live import watch_live
 from deploy.options import Evaluate, Watch, ray_address
+from deploy.policies import newest_policy
 from deploy.tables import evaluation_table
-from learner.checkpoint import newest_valid
 from learner.config import RunConfig
-from learner.policy_file import read_policy, read_saved_policy
 from learner.presets import preset_config
 from learner.ray_edge import evaluate_in_tasks
 from learner.results import summarise
-from learner.run_folder import RunFolder, find_run
+from learner.run_folder import find_run
 from sim_core import ENV_ID
 from sim_core.checks import require
 from sim_core.config import WorldConfig
@@ -41,22 +41,6 @@ class Entry(NamedTuple):
     player: str
     updates: int
     title: str
-
-
-def load_policy(folder: RunFolder, config: RunConfig) -> WeightsSnapshot:
-    """A run's policy: that of its newest usable checkpoint, or the one that a sweep's cell has kept.
-
-    Raises:
-      CheckpointError: there is none, or it does not fit the config.
-    """
-    shape = env_shape(config.env)
-    is_swept = folder.results.is_file() or not folder.checkpoints.exists()
-    if folder.policy.is_file() and is_swept:  # of a cell that is done, only the policy is kept
-        return read_saved_policy(folder.policy, config, shape)
-    checkpoint, skipped = newest_valid(folder.checkpoints)
-    for reason in skipped:
-        Console(stderr=True).print(f"skipped: {reason}", highlight=False)
-    return read_policy(checkpoint, config, shape)
 
 
 def evaluate(command: Evaluate) -> int:
@@ -99,7 +83,7 @@ def _run_entry(command: Evaluate) -> Entry:
         f"--robots and --groups apply to our own environment, not to {config.env_id}",
     )
     config = dataclasses.replace(config, world=_on_setup(config.world, command))
-    weights = load_policy(folder, config)
+    weights = newest_policy(folder, config)
     title = f"{config.world.method} {config.world.setup}" if config.env.is_swarm else config.env_id
     return Entry(config.env, weights, folder.path.name, weights.version, title)
 
@@ -133,10 +117,12 @@ def _record(out: Path, entry: Entry, seeds: list[int]) -> None:
 
 
 def watch(command: Watch) -> int:
-    """Renders an episode; returns the exit code."""
+    """Renders an episode, or goes on playing the newest policy; returns the exit code."""
     folder = find_run(command.run, command.runs_dir)
     config = folder.config()
-    weights = load_policy(folder, config)
+    if command.live:
+        return watch_live(folder, config, command)
+    weights = newest_policy(folder, config)
     path = command.out or folder.artifacts / f"episode-{command.seed}.{command.format}"
     path.parent.mkdir(parents=True, exist_ok=True)
     if config.env.is_swarm:

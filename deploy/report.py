@@ -63,11 +63,11 @@ def _write(out: Path, source: str, parts: list[PresetPart]) -> None:
             save_png(picture.draw(part.results), folder / picture.file)
     for diagram in DIAGRAMS:
         save_png(diagram.draw(), out / diagram.file)
-    _write_text(out / "claims.md", claims_markdown({part.name: part.claims for part in parts}))
-    _write_text(out / "report.md", report_markdown(source, parts))
+    write_text(out / "claims.md", claims_markdown({part.name: part.claims for part in parts}))
+    write_text(out / "report.md", report_markdown(source, parts))
 
 
-def _write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
     """Writes a file; an older one is replaced once the new is whole."""
     part = path.with_name(path.name + ".part")
     with part.open("w", encoding="utf-8", newline="\n") as file:

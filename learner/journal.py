@@ -55,8 +55,9 @@ class Journal:
         self._file.seek(offset)
 
     def append(self, row: Row) -> None:
-        """Writes one row."""
+        """Writes one row, at once, so that whoever looks into a run sees it; `sync` makes it durable."""
         self._file.write(json.dumps(row).encode() + b"\n")
+        self._file.flush()
 
     def sync(self) -> int:
         """Makes all rows durable; returns the file's length in bytes."""
@@ -75,6 +76,15 @@ class Journal:
     def close(self) -> None:
         """Closes the file."""
         self._file.close()
+
+
+def read_rows(path: Path) -> list[Row]:
+    """The whole rows of a journal that another process may be writing; none where there is no journal yet."""
+    try:
+        lines = path.read_bytes().split(b"\n")[:-1]  # the last one may be unfinished
+    except FileNotFoundError:
+        return []
+    return [Row(*json.loads(line)) for line in lines]
 
 
 class PushedMark:

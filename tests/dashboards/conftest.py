@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from actors.trajectory import Episode
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
 from sim_core.worlds import WorldBatch
+from tests.dashboards.chromium import open_chromium
 
 Recorder = Callable[..., Episode]
 
@@ -68,3 +70,9 @@ def episode(config: WorldConfig) -> Episode:
 def failed(config: WorldConfig) -> Episode:
     """An episode in which the learning robot leaves its group."""
     return record_episode(config, seed=3, action=0)
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    with open_chromium(tmp_path_factory.mktemp("chromium")) as chromium:
+        yield chromium

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from learner.journal import Journal, PushedMark, Row
+from learner.journal import Journal, PushedMark, Row, read_rows
 from sim_core.checks import ConfigError
 
 ROWS = [Row(100 * i, 1_700_000_000_000 + i, {"a/b": i / 3, "c": float(i)}) for i in range(5)]
@@ -100,3 +100,15 @@ def test_an_unreadable_mark_pushes_everything_again(tmp_path, text):
     path = tmp_path / "metrics.pushed"
     path.write_text(text)
     assert PushedMark(path, 500).read() == 0
+
+
+def test_rows_are_read_while_they_are_written(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    assert read_rows(path) == []
+    journal = Journal(path, 0)
+    journal.append(Row(1, 2, {"a": 0.5}))
+    assert read_rows(path) == [Row(1, 2, {"a": 0.5})]
+    journal.close()
+    with path.open("ab") as file:
+        file.write(b'[3, 4, {"a"')  # a row of which a part is written
+    assert read_rows(path) == [Row(1, 2, {"a": 0.5})]

@@ -1,0 +1,3 @@
+// The page of one episode.
+"use strict";
+load(JSON.parse(element("data").textContent));
