@@ -11,6 +11,7 @@ import torch
 
 from deploy.cli import main, parse
 from learner.presets import preset_config
+from learner.run_folder import RunFolder
 from tests.integration.conftest import SMALL, flags
 
 
@@ -56,6 +57,8 @@ def free_port() -> int:
         (["--config", "missing.toml", "--preset", "best"], ["--config", "--preset", "leave one"]),
         (["--preset", "ours"], ["--preset", "thesis", "best"]),
         (["--runs-dir", "/proc/nothing"], ["--runs-dir", "write"]),
+        (["--deadline-s", "0.5"], ["--deadline-s", "at least 1"]),
+        (["--start-deadline-s", "0"], ["--start-deadline-s", "at least 1"]),
     ],
 )
 def test_train_refuses(capsys, tmp_path, monkeypatch, arguments, words):
@@ -144,6 +147,12 @@ class TestWithARun:
         code, error = run(capsys, "train", "--runs-dir", str(runs), "--name", "r")
         assert code == 2
         assert "shoal resume r" in error
+
+    def test_a_run_that_another_process_trains_is_refused(self, capsys, runs):
+        with RunFolder(runs / "r").hold():
+            code, error = run(capsys, "resume", "r", "--runs-dir", str(runs), "--total-env-steps", "9000")
+        assert code == 2
+        assert "another process is training" in error
 
     def test_an_unknown_run_is_refused(self, capsys, runs):
         for command in ("resume", "evaluate", "watch"):
