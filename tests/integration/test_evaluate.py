@@ -127,7 +127,7 @@ def test_a_baselines_name_is_taken_and_a_run_of_that_name_is_named_as_a_folder(c
         (["greedy", "--record", "3", "--episodes", "2", "--out", "e.zarr"], ["--record", "0..2", "3"]),
         (["greedy", "--out", "e.csv"], ["--out", ".zarr", "e.csv"]),
         (["greedy", "--out", ""], ["--out", ".zarr"]),
-        (["greedy", "--out", "/proc/nothing/e.zarr"], ["--out", "/proc/nothing/e.zarr", "write"]),
+        (["greedy", "--out", "/proc/nothing/e.zarr"], ["--out", "/proc/nothing", "write"]),
         (["greedy", "--out", "taken.zarr"], ["taken.zarr exists", "not overwritten"]),
         (["greedy", "--out", "half.zarr", "--record", "1"], ["half-episodes.zarr exists", "not overwritten"]),
         (["nobody"], ["nobody", "runs there: c, r"]),
