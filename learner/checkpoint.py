@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from sim_core.checks import ConfigError
 
-FORMAT = "shoal-checkpoint-2"
+FORMAT = "shoal-checkpoint-3"
 MANIFEST = "manifest.json"
 STATE = "state.json"
 PREFIX = "step-"

@@ -192,11 +192,11 @@ def test_the_newest_are_kept(tmp_path):
     assert newest_valid(tmp_path)[0].folder.name == "step-000000000100"
 
 
-@pytest.mark.parametrize("found", ["shoal-checkpoint-1", "shoal-checkpoint-3", None])
+@pytest.mark.parametrize("found", ["shoal-checkpoint-1", "shoal-checkpoint-2", None])
 def test_another_format_is_refused(folder, found):
     manifest = json.loads((folder / "manifest.json").read_text())
     (folder / "manifest.json").write_text(json.dumps(manifest | {"format": found}))
-    with pytest.raises(CheckpointError, match="shoal-checkpoint-2"):
+    with pytest.raises(CheckpointError, match="shoal-checkpoint-3"):
         read_checkpoint(folder)
 
 
