@@ -127,10 +127,11 @@ REPLAY = (
     ),
 )
 
+# Ray shows a counter once it counts: what should stay 0 is a gauge.
 ACCOUNTS = (
     _counter("account/produced", "transitions_produced", "transitions", "made by rollout workers", "stored + dropped"),
     _counter("account/stored", "transitions_stored", "transitions", "stored by replay shards", "grows"),
-    _counter("account/dropped", "transitions_dropped", "transitions", "lost with a part, or that came twice", "0"),
+    _gauge("account/dropped", "transitions_dropped", "transitions", "lost with a part, or that came twice", "0"),
     _counter("account/sampled", "transitions_sampled", "transitions", "drawn for updates", "updates x `batch_size`"),
 )
 
