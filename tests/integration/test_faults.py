@@ -45,6 +45,7 @@ def test_metrics_of_an_outage_of_mlflow_arrive_later_and_once(server, tmp_path):
         delivered = PushedMark.value(folder.pushed)
         wait_until(lambda: "training done" in job.log.read_text(), job)  # nobody waited for the server
         assert PushedMark.value(folder.pushed) == delivered < folder.journal.stat().st_size
+        wait_until(lambda: "MLflow does not take the metrics" in job.log.read_text(), job)  # its client has tried
         server.start()
         assert job.process.wait(200) == 0, job.log.read_text()
     finally:
