@@ -140,10 +140,10 @@ def _outcome(state, out, params):
 def _reward(state, outcome, out, params):
     p = params[0]
     for world in range(out.shape[0]):
-        closer = came_closer(state, world, p.ellipse.robots)
+        closer = came_closer(state, world, p.ellipse.robots) if p.rewards_progress else True
         if outcome[world] == _RUNNING or (outcome[world] == _TIMEOUT and not p.timeout_fails):
             share = p.reward_scale / STEP_REWARD_SHARE
-            good = state.outside_steps[world] == 0 and (closer or not p.rewards_progress)
+            good = state.outside_steps[world] == 0 and closer
             reward = share if good else -share
         else:
             reward = p.reward_scale if outcome[world] == _GOAL else -p.reward_scale
