@@ -12,6 +12,7 @@ from actors.vector_env import env_shape
 from dashboards.curve import CurvePoint, learning_curve_png
 from dashboards.player import player_html
 from dashboards.video import episode_frames, write_mp4
+from deploy.folders import write_text
 from learner.config import RunConfig
 from learner.journal import Row
 from learner.results import as_metrics, outcome_label
@@ -95,9 +96,7 @@ def _first_success(config: RunConfig, weights: WeightsSnapshot) -> Episode:
 def write_player(store: Path, page: Path, title: str) -> None:
     """Writes the player of the first episode recorded in `store` to `page`."""
     episodes, world = load_episodes(store)
-    part = page.with_name(page.name + ".part")
-    part.write_text(player_html(episodes[0], world, title), "utf-8")
-    part.replace(page)
+    write_text(page, player_html(episodes[0], world, title))
 
 
 def write_video(store: Path, path: Path) -> None:

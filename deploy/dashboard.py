@@ -11,9 +11,8 @@ from rich.console import Console
 from dashboards.server import PageServer
 from dashboards.web_report import report_data, report_page
 from deploy.dashboard_source import Source, find_source
-from deploy.folders import make_folder
-from deploy.live import serve_until_interrupted
-from deploy.report import write_text
+from deploy.folders import make_folder, write_text
+from deploy.live import episode_number, serve_until_interrupted
 from deploy.shelves import samples
 
 if TYPE_CHECKING:
@@ -87,10 +86,7 @@ class LiveReport:
         Raises:
           LookupError: there is none such.
         """
-        number = query.get("number", "")
-        if not number.isdecimal():
-            raise LookupError(f"episode {number!r}")
-        return self._source.shelf.episode(query.get("key", ""), query.get("outcome", ""), int(number))
+        return self._source.shelf.episode(query.get("key", ""), query.get("outcome", ""), episode_number(query))
 
 
 def report_server(source: Source, port: int) -> PageServer:

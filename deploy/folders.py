@@ -1,4 +1,4 @@
-"""Folders that the command line writes to."""
+"""Folders and files that the command line writes to."""
 
 from __future__ import annotations
 
@@ -36,3 +36,13 @@ def check_plain_name(name: str) -> None:
     """Raises ConfigError unless `--name` names a folder within another, and none elsewhere."""
     plain = name == Path(name).name and name not in ("", ".", "..")
     require(plain, f"--name must be a plain folder name, not {name!r}")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a file; an older one is replaced once the new is whole."""
+    part = path.with_name(path.name + ".part")
+    with part.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)

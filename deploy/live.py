@@ -48,7 +48,7 @@ class LiveRun:
           ConfigError: there is no policy yet.
           LookupError: the number is none.
         """
-        number = _number(query)
+        number = episode_number(query)
         try:
             weights = self._policy.get()
         except ConfigError as error:
@@ -66,7 +66,8 @@ class LiveRun:
         }
 
 
-def _number(query: Mapping[str, str]) -> int:
+def episode_number(query: Mapping[str, str]) -> int:
+    """The number that a page asks for; raises LookupError if it is none."""
     text = query.get("number", "")
     if not text.isdecimal():
         raise LookupError(f"episode {text!r}")

@@ -20,8 +20,37 @@ Switch = Annotated[UseCounterAction[int], arg(help_behavior_hint="(off by defaul
 """A flag without a value: 0 unless it is given."""
 
 
+def ray_address(given: str | None) -> str | None:
+    """The Ray cluster in force, None for a Ray of its own."""
+    return given or os.environ.get("RAY_ADDRESS") or None
+
+
 @dataclass(frozen=True, kw_only=True)
-class Launch:
+class OnRay:
+    """On which Ray a run's parts are placed, and when one of them is late."""
+
+    address: str | None = None
+    """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
+    deadline_s: float = DEADLINE_S
+    """Seconds of silence after which a part of the run that owes an answer is replaced (Ray only)."""
+    start_deadline_s: float = START_DEADLINE_S
+    """The same for a part that is being started or saved."""
+
+    def __post_init__(self) -> None:
+        require(self.deadline_s >= 1, f"--deadline-s must be at least 1, not {self.deadline_s}")
+        require(self.start_deadline_s >= 1, f"--start-deadline-s must be at least 1, not {self.start_deadline_s}")
+
+    def ray_address(self) -> str | None:
+        """The Ray cluster in force, None for a Ray of its own."""
+        return ray_address(self.address)
+
+    def place(self) -> Place:
+        """Where the run's parts go."""
+        return Place(self.ray_address(), self.deadline_s, self.start_deadline_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Launch(OnRay):
     """Where a run is stored, logged and placed."""
 
     runs_dir: Path = Path("runs")
@@ -32,15 +61,6 @@ class Launch:
     """MLflow tracking URI; MLFLOW_TRACKING_URI or a sqlite file in runs_dir by default."""
     experiment: str = "shoal"
     """MLflow experiment."""
-    address: str | None = None
-    """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
-    deadline_s: float = DEADLINE_S
-    """Seconds of silence after which a part of the run that owes an answer is replaced (Ray only)."""
-    start_deadline_s: float = START_DEADLINE_S
-    """The same for a part that is being started or saved."""
-
-    def __post_init__(self) -> None:
-        check_deadlines(self.deadline_s, self.start_deadline_s)
 
     def tracking(self) -> str:
         """The tracking URI in force."""
@@ -54,25 +74,6 @@ class Launch:
     def sweep_experiment(self, name: str) -> str:
         """MLflow experiment of a sweep: the given one, or one of its own."""
         return f"sweep {name}" if self.experiment == type(self).experiment else self.experiment
-
-    def ray_address(self) -> str | None:
-        """The Ray cluster in force, None for a Ray of its own."""
-        return ray_address(self.address)
-
-    def place(self) -> Place:
-        """Where the run's parts go."""
-        return Place(self.ray_address(), self.deadline_s, self.start_deadline_s)
-
-
-def check_deadlines(deadline_s: float, start_deadline_s: float) -> None:
-    """Raises ConfigError for a deadline that a sound part may miss."""
-    require(deadline_s >= 1, f"--deadline-s must be at least 1, not {deadline_s}")
-    require(start_deadline_s >= 1, f"--start-deadline-s must be at least 1, not {start_deadline_s}")
-
-
-def ray_address(given: str | None) -> str | None:
-    """The Ray cluster in force, None for a Ray of its own."""
-    return given or os.environ.get("RAY_ADDRESS") or None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +120,7 @@ class Report:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Resume:
+class Resume(OnRay):
     """Go on with a run from its newest usable checkpoint."""
 
     run: Positional[str]
@@ -130,19 +131,6 @@ class Resume:
     """Where the learner's networks live; as before by default."""
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
-    address: str | None = None
-    """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
-    deadline_s: float = DEADLINE_S
-    """Seconds of silence after which a part of the run that owes an answer is replaced (Ray only)."""
-    start_deadline_s: float = START_DEADLINE_S
-    """The same for a part that is being started or saved."""
-
-    def __post_init__(self) -> None:
-        check_deadlines(self.deadline_s, self.start_deadline_s)
-
-    def place(self) -> Place:
-        """Where the run's parts go."""
-        return Place(ray_address(self.address), self.deadline_s, self.start_deadline_s)
 
 
 @dataclass(frozen=True, kw_only=True)

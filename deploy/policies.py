@@ -6,7 +6,7 @@ from rich.console import Console
 
 from actors.network import WeightsSnapshot
 from actors.vector_env import env_shape
-from learner.checkpoint import newest_valid
+from learner.checkpoint import finished_folders, newest_valid
 from learner.config import RunConfig
 from learner.policy_file import read_policy, read_saved_policy
 from learner.run_folder import RunFolder
@@ -66,6 +66,5 @@ class NewestPolicy:
 
 def policy_signature(folder: RunFolder) -> tuple[str, ...]:
     """Changes when a run has another newest policy."""
-    whole = {path.name for path in folder.checkpoints.glob("step-*") if not path.suffix}
-    names = sorted(whole)[-1:]
+    names = [path.name for path in finished_folders(folder.checkpoints)[:1]]
     return (*names, str(folder.policy.stat().st_mtime_ns)) if folder.policy.is_file() else tuple(names)

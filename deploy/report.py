@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import zlib
 from pathlib import Path
@@ -18,7 +17,7 @@ from dashboards.pictures import save_png
 from dashboards.pooled import Results
 from dashboards.report import PresetPart, baselines_of, presets_of, report_markdown
 from dashboards.result_figures import PICTURES
-from deploy.folders import make_folder
+from deploy.folders import make_folder, write_text
 from sim_core.checks import require
 
 if TYPE_CHECKING:
@@ -65,13 +64,3 @@ def _write(out: Path, source: str, parts: list[PresetPart]) -> None:
         save_png(diagram.draw(), out / diagram.file)
     write_text(out / "claims.md", claims_markdown({part.name: part.claims for part in parts}))
     write_text(out / "report.md", report_markdown(source, parts))
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a file; an older one is replaced once the new is whole."""
-    part = path.with_name(path.name + ".part")
-    with part.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)

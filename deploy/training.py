@@ -16,7 +16,7 @@ from deploy.folders import check_lasting, check_plain_name, make_folder
 from deploy.options import Launch, Resume, Train
 from deploy.progress import make_display
 from deploy.tables import evaluation_table, summary_lines
-from learner.checkpoint import PREFIX, Checkpoint
+from learner.checkpoint import Checkpoint, finished_folders
 from learner.config import RunConfig, config_hash
 from learner.journal import Row
 from learner.learner import learning_device
@@ -92,7 +92,7 @@ def _go_on(folder: RunFolder, config: RunConfig, place: Place) -> int:
         Console().print(f"run {folder.path} has finished before", highlight=False, soft_wrap=True)
         return 0
     checkpoint = None
-    if any(path.suffix != ".part" for path in folder.checkpoints.glob(f"{PREFIX}*")):
+    if finished_folders(folder.checkpoints):
         checkpoint, skipped = resume_point(folder, config)
         _say_where(checkpoint, skipped)
     return _resumed(folder, config, tracker, checkpoint, place)

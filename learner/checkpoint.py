@@ -67,9 +67,9 @@ def write_checkpoint(root: Path, env_steps: int, save_parts: Callable[[Path], di
 
 def keep_newest(root: Path, count: int) -> None:
     """Removes all but the `count` newest checkpoints, and what crashed writers left."""
-    for left in set(root.glob(f"{PREFIX}*")) - set(_folders(root)):
+    for left in set(root.glob(f"{PREFIX}*")) - set(finished_folders(root)):
         shutil.rmtree(left, ignore_errors=True)
-    for old in _folders(root)[count:]:
+    for old in finished_folders(root)[count:]:
         shutil.rmtree(old, ignore_errors=True)
 
 
@@ -107,7 +107,7 @@ def newest_valid(root: Path) -> tuple[Checkpoint, list[str]]:
       CheckpointError: there is none.
     """
     skipped: list[str] = []
-    for folder in _folders(root):
+    for folder in finished_folders(root):
         try:
             return read_checkpoint(folder), skipped
         except CheckpointError as error:
@@ -116,7 +116,7 @@ def newest_valid(root: Path) -> tuple[Checkpoint, list[str]]:
     raise CheckpointError(f"no usable checkpoint in {root}{reason}")
 
 
-def _folders(root: Path) -> list[Path]:
+def finished_folders(root: Path) -> list[Path]:
     """Finished checkpoints, newest first; one that was being replaced counts until its successor is in place."""
     names = (path for path in root.glob(f"{PREFIX}*") if path.is_dir() and path.suffix != ".part")
     return sorted((path for path in names if not (path.suffix and path.with_suffix("").exists())), reverse=True)
