@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,8 +18,11 @@ from safetensors.numpy import load_file, save_file
 
 from actors.calls import Calls, Node, Ref
 from actors.network import WeightsSnapshot
+from actors.parts import PartWriter, Written
+from actors.places import Place, fetched
 from actors.replay import ReplayShard
 from actors.rollout import RolloutSettings, RolloutWorker
+from actors.storage import save_rows
 from actors.transitions import AddReply, BlockReport, SampleReply, TransitionBlock
 
 
@@ -35,6 +39,7 @@ class ShardNode:
 
     def __init__(self, settings: ShardSettings) -> None:
         self.shard = ReplayShard(*settings)
+        self._writer = PartWriter()
         self._version = -1
         self._weights: Ref = None
 
@@ -56,13 +61,29 @@ class ShardNode:
         """Transitions held."""
         return self.shard.size
 
-    def save(self, path: Path) -> dict[str, Any]:
-        """Saves the shard (see ReplayShard.save)."""
-        return self.shard.save(path)
+    def save(self, place: Place) -> dict[str, Any]:
+        """Starts to write the shard's rows as they are now to a zarr group at `place`; `saved` tells of its end.
 
-    def load(self, path: Path, state: dict[str, Any]) -> None:
-        """Loads the shard (see ReplayShard.load)."""
-        self.shard.load(path, state)
+        Returns:
+          The state that belongs to them, for JSON.
+        """
+        rows = self.shard.snapshot()
+
+        def write(path: Path) -> None:
+            with closing(rows):
+                save_rows(path, rows)
+
+        self._writer.start(place, write)
+        return self.shard.get_state()
+
+    def saved(self) -> Written | None:
+        """How the last `save` ended; None while it is being written."""
+        return self._writer.result()
+
+    def load(self, place: Place, state: dict[str, Any]) -> None:
+        """Takes up what `save` wrote and returned (see ReplayShard.load)."""
+        with fetched(place) as path:
+            self.shard.load(path, state)
 
 
 class RolloutNode:
@@ -93,6 +114,7 @@ class RolloutNode:
         self._shards = shards
         self._next_shard = worker_id % len(shards)
         self._limit = pushes_in_flight
+        self._writer = PartWriter()
         self._pushes: deque[tuple[TransitionBlock, Ref]] = deque()
 
     def set_weights(self, weights: WeightsSnapshot) -> None:
@@ -133,27 +155,35 @@ class RolloutNode:
             staleness_s=time.time() - block.header.policy_time_s,
         )
 
-    def save(self, path: Path) -> dict[str, Any]:
-        """Writes the worker's arrays to `path`; returns the rest of its state, for JSON.
+    def save(self, place: Place) -> dict[str, Any]:
+        """Starts to write the worker's arrays as they are now to the file `place`; `saved` tells of its end.
+
+        Returns:
+          The rest of its state, for JSON.
 
         Raises:
           RuntimeError: pushes are under way.
         """
         if self._pushes:
             raise RuntimeError("settle before the state is saved: pushes are under way")
-        saved = self._worker.get_state()
-        save_file(saved["arrays"], str(path))
-        return {**saved["meta"], "next_shard": self._next_shard}
+        state = self._worker.get_state()
+        self._writer.start(place, lambda path: save_file(state["arrays"], str(path)))
+        return {**state["meta"], "next_shard": self._next_shard}
 
-    def load(self, path: Path, state: dict[str, Any]) -> None:
+    def saved(self) -> Written | None:
+        """How the last `save` ended; None while it is being written."""
+        return self._writer.result()
+
+    def load(self, place: Place, state: dict[str, Any]) -> None:
         """Takes up what `save` wrote and returned.
 
         Raises:
           ValueError: the file is damaged or does not fit.
         """
         try:
-            arrays = load_file(str(path))
+            with fetched(place) as path:
+                arrays = load_file(str(path))
         except (SafetensorError, OSError) as error:
-            raise ValueError(f"{path} cannot be read ({error})") from error
+            raise ValueError(f"{place} cannot be read ({error})") from error
         self._next_shard = state["next_shard"] % len(self._shards)
         self._worker.set_state(arrays, state)

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.storage import load_rows, save_rows
+from actors.ring_snapshot import RingSnapshot
+from actors.storage import load_rows
 from actors.transitions import SCHEMA_VERSION, BlockHeader, SampleReply, TransitionBlock
 
 
@@ -43,6 +44,7 @@ class ReplayShard:
         self._dropped = 0
         self._newest: dict[int, tuple[int, int]] = {}
         self._rng = np.random.Generator(np.random.PCG64(seed))
+        self._snapshot = RingSnapshot(self._rows, 0)
 
     @property
     def size(self) -> int:
@@ -87,6 +89,8 @@ class ReplayShard:
         capacity = len(self._rows)
         rows = rows[-capacity:]
         first = min(len(rows), capacity - self._next)
+        self._snapshot.protect(self._next, self._next + first)
+        self._snapshot.protect(0, len(rows) - first)
         self._rows[self._next : self._next + first] = rows[:first]
         self._rows[: len(rows) - first] = rows[first:]
         self._next = (self._next + len(rows)) % capacity
@@ -105,7 +109,7 @@ class ReplayShard:
         return SampleReply(taken.view(self._rows.dtype).reshape(count), self._size)
 
     def get_state(self) -> dict[str, Any]:
-        """Counters and random stream, for JSON; the rows are saved by `save`."""
+        """Counters and random stream, for JSON; the rows are in `snapshot`."""
         return {
             "next": self._next,
             "size": self._size,
@@ -115,22 +119,22 @@ class ReplayShard:
             "rng": self._rng.bit_generator.state,
         }
 
-    def save(self, path: Path) -> dict[str, Any]:
-        """Writes the rows to a zarr group at `path` and returns the state that belongs to them."""
-        save_rows(path, self._rows[: self._size])
-        return self.get_state()
+    def snapshot(self) -> RingSnapshot:
+        """The rows as they are now, for `save_rows` in another thread; one taken before may not be read any more."""
+        self._snapshot = RingSnapshot(self._rows, self._size)
+        return self._snapshot
 
     def load(self, path: Path, state: dict[str, Any]) -> None:
-        """Takes up what `save` wrote and returned.
+        """Takes up the rows of a `snapshot` that were saved at `path`, and the `get_state` of the same moment.
 
         Raises:
           ValueError: the saved rows do not fit this shard.
         """
-        rows = load_rows(path, self._rows.dtype)
+        rows = load_rows(path, self._rows.dtype, at_most=len(self._rows))
         if len(rows) != state["size"]:
             raise ValueError(f"{path} holds {len(rows)} transitions, not the {state['size']} of its checkpoint")
         capacity = len(self._rows)
-        if len(rows) > capacity or (len(rows) < capacity and state["next"] != len(rows)):
+        if state["next"] != (len(rows) if len(rows) < capacity else state["next"] % capacity):
             raise ValueError(f"{path} is the ring of a shard with another capacity than {capacity}")
         self._rows[: len(rows)] = rows
         self._next, self._size = state["next"], state["size"]

@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from actors.places import as_place, check_writable, inside
+from learner.checkpoint_store import open_store
+from learner.run_folder import Storage
 from sim_core.checks import ConfigError, require
 
 
@@ -19,6 +22,28 @@ def make_folder(path: Path, flag: str) -> None:
     except OSError as error:
         raise ConfigError(f"{flag} {path} cannot be made ({error}); name a folder that you may write to") from error
     require(os.access(path, os.W_OK), f"{flag} {path} cannot be written to; name a folder that you may write to")
+
+
+def new_storage(checkpoint_url: str | None, name: str, keep_best: int) -> Storage:
+    """How a new run `name` stores its checkpoints: under `--checkpoint-url`, in a folder of its own there.
+
+    Raises:
+      ConfigError: nothing can be written there, or a run of that name has checkpoints there.
+    """
+    if checkpoint_url is None:
+        return Storage(None, keep_best)
+    root = as_place(checkpoint_url)
+    if isinstance(root, Path):
+        make_folder(root, "--checkpoint-url")
+    else:
+        check_writable(root)
+    place = inside(root, name)
+    try:
+        taken = open_store(place).names()
+    except OSError as error:
+        raise ConfigError(f"--checkpoint-url {place} cannot be listed ({error}); name another one") from error
+    require(not taken, f"--checkpoint-url {place} holds the checkpoints of another run; choose another --name or URL")
+    return Storage(str(place), keep_best)
 
 
 def check_plain_name(name: str) -> None:

@@ -65,6 +65,13 @@ class Train:
     """What to learn."""
     launch: Launch = field(default_factory=Launch)
     """Where."""
+    checkpoint_url: str | None = None
+    """Folder or fsspec URL (s3://bucket/path) for the run's checkpoints; its own folder by default."""
+    keep_best: int = 1
+    """Checkpoints that did best in the evaluations during training, kept beside the newest (--keep-checkpoints)."""
+
+    def __post_init__(self) -> None:
+        require(self.keep_best >= 0, f"--keep-best must be at least 0, not {self.keep_best}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,6 +133,8 @@ class Evaluate:
     """Robots per group; by default those of the training (others: Extrapolation), or 10 for a baseline."""
     groups: int | None = None
     """Groups; by default those of the training (others: Extrapolation), or 2 for a baseline."""
+    checkpoint: Literal["newest", "best"] = "newest"
+    """The newest checkpoint's policy, or the one that did best in the evaluations during training."""
     out: Path | None = None
     """New file (.zarr) for the results: seed, outcome, length and return of every episode."""
     record: int = 0
@@ -164,6 +173,8 @@ class Watch:
     """Seed of the episode."""
     out: Path | None = None
     """File to write; `episode-SEED` in the run's artifacts by default."""
+    checkpoint: Literal["newest", "best"] = "newest"
+    """The newest checkpoint's policy, or the one that did best in the evaluations during training."""
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
 

@@ -20,12 +20,14 @@ from dashboards.strip import episode_strip_png
 from deploy.artifacts import foreign_animation, write_player, write_video
 from deploy.options import Evaluate, Watch, ray_address
 from deploy.tables import evaluation_table
-from learner.checkpoint import newest_valid
+from learner.checkpoint import best_valid, newest_valid
 from learner.config import RunConfig
+from learner.journal import journal_rows
 from learner.policy_file import read_policy, read_saved_policy
 from learner.presets import preset_config
 from learner.ray_edge import evaluate_in_tasks
 from learner.results import summarise
+from learner.retention import scores_of
 from learner.run_folder import RunFolder, find_run
 from sim_core import ENV_ID
 from sim_core.checks import ConfigError, require
@@ -43,14 +45,16 @@ class Entry(NamedTuple):
     title: str
 
 
-def _load(folder: RunFolder, config: RunConfig) -> WeightsSnapshot:
+def _load(folder: RunFolder, config: RunConfig, which: str) -> WeightsSnapshot:
     shape = env_shape(config.env)
-    is_swept = folder.results.is_file() or not folder.checkpoints.exists()
+    is_swept = folder.results.is_file() or not (folder.checkpoints.exists() or folder.storage().checkpoint_url)
     if folder.policy.is_file() and is_swept:  # of a cell that is done, only the policy is kept
         return read_saved_policy(folder.policy, config, shape)
-    checkpoint, skipped = newest_valid(folder.checkpoints)
+    place = folder.checkpoint_place()
+    scores = scores_of(journal_rows(folder.journal)) if which == "best" else None
+    checkpoint, skipped = newest_valid(place) if scores is None else best_valid(place, scores)
     for reason in skipped:
-        Console(stderr=True).print(f"skipped: {reason}", highlight=False)
+        Console(stderr=True).print(f"skipped: {reason}", markup=False, highlight=False, soft_wrap=True)
     return read_policy(checkpoint, config, shape)
 
 
@@ -94,7 +98,7 @@ def _run_entry(command: Evaluate) -> Entry:
         f"--robots and --groups apply to our own environment, not to {config.env_id}",
     )
     config = dataclasses.replace(config, world=_on_setup(config.world, command))
-    weights = _load(folder, config)
+    weights = _load(folder, config, command.checkpoint)
     title = f"{config.world.method} {config.world.setup}" if config.env.is_swarm else config.env_id
     return Entry(config.env, weights, folder.path.name, weights.version, title)
 
@@ -135,7 +139,7 @@ def watch(command: Watch) -> int:
     """Renders an episode; returns the exit code."""
     folder = find_run(command.run, command.runs_dir)
     config = folder.config()
-    weights = _load(folder, config)
+    weights = _load(folder, config, command.checkpoint)
     path = command.out or folder.artifacts / f"episode-{command.seed}.{command.format}"
     path.parent.mkdir(parents=True, exist_ok=True)
     if config.env.is_swarm:

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from actors.vector_env import env_shape
 from deploy.artifacts import log_artifacts
-from deploy.folders import check_plain_name, make_folder
+from deploy.folders import check_plain_name, make_folder, new_storage
 from deploy.options import Launch, Resume, Train, ray_address
 from deploy.progress import make_display
 from deploy.tables import evaluation_table, summary_lines
@@ -43,8 +43,10 @@ def train(command: Train) -> int:
     folder = _new_folder(config, launch)
     make_folder(launch.runs_dir, "--runs-dir")
     env_shape(config.env)  # refuses an environment that cannot be made
+    storage = new_storage(command.checkpoint_url, folder.path.name, command.keep_best)
     tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
     tracker.start(config)
+    folder.save_storage(storage)
     folder.save_config(config)
     folder.save_identity(RunIdentity(config.name, tracker.uri, launch.experiment, tracker.run_id))
     return _run(folder, config, tracker, None, launch.ray_address())
@@ -61,8 +63,8 @@ def resume(command: Resume) -> int:
     folder.save_config(config)
     console = Console()
     for reason in skipped:
-        console.print(f"skipped: {reason}", highlight=False)
-    console.print(f"going on from {checkpoint.folder}", highlight=False, soft_wrap=True)
+        console.print(f"skipped: {reason}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"going on from {checkpoint.folder}", markup=False, highlight=False, soft_wrap=True)
     return _run(folder, config, tracker, checkpoint, ray_address(command.address))
 
 
@@ -91,7 +93,8 @@ def _run(
         result = execute(folder, config, tracker, display, checkpoint, address, finish)
     if result.evaluation is None:
         name = signal.Signals(result.stopped_by).name if result.stopped_by else "a signal"
-        console.print(f"stopped by {name} at {result.env_steps:,} env steps; checkpoint saved", highlight=False)
+        saved = "checkpoint saved" if result.checkpoint else "its checkpoint could not be written"
+        console.print(f"stopped by {name} at {result.env_steps:,} env steps; {saved}", highlight=False)
         console.print(f"go on with: {resume_command(folder)}", highlight=False, soft_wrap=True)
         return 128 + (result.stopped_by or 0)
     console.print(evaluation_table(result.evaluation, config.name))

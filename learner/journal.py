@@ -50,22 +50,41 @@ class Journal:
         """Writes one row."""
         self._file.write(json.dumps(row).encode() + b"\n")
 
+    def flush(self) -> int:
+        """Hands all rows to the system; returns the file's length in bytes."""
+        self._file.flush()
+        return self._file.tell()
+
     def sync(self) -> int:
         """Makes all rows durable; returns the file's length in bytes."""
         self._file.flush()
         os.fsync(self._file.fileno())
         return self._file.tell()
 
-    def rows(self, start: int = 0) -> list[Row]:
-        """The rows from byte `start` on."""
+    def rows(self, start: int = 0, stop: int | None = None) -> list[Row]:
+        """The rows from byte `start` on, to byte `stop` or the end."""
         self._file.flush()
         with self._path.open("rb") as file:
             file.seek(start)
-            return [Row(*json.loads(line)) for line in file]
+            lines = file.read(-1 if stop is None else max(0, stop - start)).splitlines()
+            return [Row(*json.loads(line)) for line in lines]
 
     def close(self) -> None:
         """Closes the file."""
         self._file.close()
+
+
+def journal_rows(path: Path) -> list[Row]:
+    """The rows of a run's journal that no process need have open; a last line that a crash cut off is left out.
+
+    Raises:
+      ConfigError: the file cannot be read or holds something else.
+    """
+    try:
+        lines = path.read_bytes().split(b"\n")[:-1]
+        return [Row(*json.loads(line)) for line in lines]
+    except (OSError, ValueError, TypeError) as error:
+        raise ConfigError(f"the metrics {path} cannot be read ({error}); put the whole file back") from error
 
 
 class PushedMark:

@@ -7,22 +7,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from actors.calls import Ref
 from actors.evaluator import evaluate, evaluate_in_parts
 from actors.exploration import epsilon
 from actors.network import WeightsSnapshot
+from actors.places import Place, inside
 from actors.transitions import BlockReport, EpisodeStats
-from learner.checkpoint import Checkpoint, keep_newest, write_checkpoint
+from learner.checkpoint import Checkpoint, Keep
+from learner.checkpointer import Checkpointer, Ended, Moment
 from learner.cluster import Cluster
-from learner.config import RunConfig, config_hash
+from learner.config import RunConfig, to_dict
 from learner.journal import Journal, Row
 from learner.meters import Meters
 from learner.node import UpdateReport
 from learner.pacing import PacingState, make_pacer
 from learner.results import as_metrics, summarise
+from learner.retention import scores_of
 
 EVAL_SEED = 1_000_000_000
 """First seed of evaluations during training; training worlds draw theirs from other streams."""
@@ -35,8 +37,12 @@ class Observer(Protocol):
         """A row of metrics was written."""
         ...
 
-    def checkpoint(self, folder: Path, journal_offset: int) -> None:
+    def checkpoint(self, folder: Place, journal_offset: int) -> None:
         """A checkpoint is whole; rows up to the offset are covered by it."""
+        ...
+
+    def checkpoint_failed(self, env_steps: int, reason: str) -> None:
+        """The checkpoint of these env steps could not be written; the run goes on."""
         ...
 
 
@@ -55,9 +61,10 @@ class TrainingLoop:
       config: the run.
       cluster: its parts.
       journal: where metrics go.
-      checkpoints: folder of the run's checkpoints.
+      checkpoints: folder or URL of the run's checkpoints.
       observer: is told of rows and checkpoints.
       stop: asked once a round; True ends the run early, with a checkpoint.
+      keep_best: the best checkpoints that are kept beside the newest.
     """
 
     def __init__(
@@ -65,15 +72,17 @@ class TrainingLoop:
         config: RunConfig,
         cluster: Cluster,
         journal: Journal,
-        checkpoints: Path,
+        checkpoints: Place,
         observer: Observer,
         stop: Callable[[], bool],
+        keep_best: int = 0,
     ) -> None:
         self._config = config
         self._cluster = cluster
         self._calls = cluster.calls
         self._journal = journal
-        self._checkpoints = checkpoints
+        self._checkpointer = Checkpointer(checkpoints, cluster.calls)
+        self._keep_best = keep_best
         self._observer = observer
         self._stop = stop
         self._pacer = make_pacer(config, cluster.blocks_in_flight)
@@ -85,9 +94,11 @@ class TrainingLoop:
         self._incarnation = 0
         self.env_steps = 0
         self.updates = 0
+        self._saved: Place | None = None
         self._saved_at: tuple[int, int] | None = None
         self._due = {"log": config.log_every_env_steps, "eval": config.eval_every_env_steps}
         self._due["checkpoint"] = config.checkpoint_every_env_steps
+        self._wants_checkpoint = False
 
     def run(self) -> bool:
         """Trains to `total_env_steps` or until stopped, and checkpoints the end.
@@ -102,17 +113,18 @@ class TrainingLoop:
             self._send_first_weights()
         self._meters.start_clock()
         while self.env_steps < self._config.total_env_steps and not self._stop():
-            if self._is_due("eval", self._config.eval_every_env_steps):
+            if not self._evaluates_before_checkpoint() and self._is_due("eval", self._config.eval_every_env_steps):
                 self._start_evaluation()  # after the last round's checkpoint, which would wait for it
             self._start_collects()  # act, step, store: the workers push to the shards
             self._start_updates()  # sample, update, publish: when the pacer says so
             self._take_results()
             if self._is_due("log", self._config.log_every_env_steps):
                 self._write_row(self._meters.row(self._replay_size(), self._pacer.ratio()))
-            if self._is_due("checkpoint", self._config.checkpoint_every_env_steps):
-                self.checkpoint()
-        if self._saved_at != (self.env_steps, self.updates):
+            self._tend_checkpoints()
+        self._take_checkpoint(self._checkpointer.wait())
+        if self.saved is None:
             self.checkpoint()
+            self._take_checkpoint(self._checkpointer.wait())
         return self.env_steps >= self._config.total_env_steps
 
     def _send_first_weights(self) -> None:
@@ -208,33 +220,70 @@ class TrainingLoop:
         for worker in self._cluster.workers:
             self._take_blocks(self._get(worker, "settle"))
 
-    def checkpoint(self) -> Path:
-        """Writes a checkpoint of the whole run at a moment when nothing is under way."""
-        self.settle()
-        offset = self._journal.sync()
-        folder = write_checkpoint(self._checkpoints, self.env_steps, lambda part: self._save(part, offset))
-        keep_newest(self._checkpoints, self._config.keep_checkpoints)
-        self._observer.checkpoint(folder, offset)
-        self._saved_at = (self.env_steps, self.updates)
-        return folder
+    @property
+    def saved(self) -> Place | None:
+        """The checkpoint of this very moment; None if it has not been written."""
+        return self._saved if self._saved_at == (self.env_steps, self.updates) else None
 
-    def _save(self, folder: Path, journal_offset: int) -> dict[str, Any]:
-        learner = self._get(self._cluster.learner, "save", folder)
+    def _evaluates(self) -> bool:
+        return any(pending.kind == "eval" for pending in self._pending.values())
+
+    def _evaluates_before_checkpoint(self) -> bool:
+        """Whether a checkpoint waits for an evaluation to end, so that no other may begin."""
+        return self._wants_checkpoint and self._evaluates()
+
+    def _tend_checkpoints(self) -> None:
+        """Tells of a checkpoint that has ended; begins one that is due, once none and no evaluation is under way."""
+        self._take_checkpoint(self._checkpointer.poll())
+        self._wants_checkpoint |= self._is_due("checkpoint", self._config.checkpoint_every_env_steps)
+        if self._wants_checkpoint and not self._checkpointer.is_busy and not self._evaluates():
+            self.checkpoint()
+
+    def _take_checkpoint(self, ended: Ended | None) -> None:
+        if ended is None:
+            return
+        if ended.place is None:
+            self._observer.checkpoint_failed(ended.moment.env_steps, ended.error or "")
+        else:
+            self._observer.checkpoint(ended.place, ended.moment.journal_offset)
+            self._saved, self._saved_at = ended.place, (ended.moment.env_steps, ended.moment.updates)
+
+    def checkpoint(self) -> None:
+        """Begins a checkpoint of the whole run at a moment when nothing is under way; none may be being written."""
+        self.settle()
+        self._wants_checkpoint = False
+        moment = Moment(self.env_steps, self.updates, self._journal.flush())
+        draft = self._checkpointer.draft(self.env_steps)
+        state = self._save(draft, moment.journal_offset)
+        self._checkpointer.begin(moment, draft, state, self._nodes(), lambda: self._seal(moment))
+
+    def _seal(self, moment: Moment) -> Keep:
+        """Makes the journal durable before a checkpoint counts on it; tells which checkpoints stay."""
+        self._journal.sync()
+        scores = scores_of(self._journal.rows(0, moment.journal_offset))
+        return Keep(self._config.keep_checkpoints, self._keep_best, scores)
+
+    def _nodes(self) -> dict[str, Any]:
+        workers = {f"rollout worker {i}": worker for i, worker in enumerate(self._cluster.workers)}
+        return {"the learner": self._cluster.learner, **workers}
+
+    def _save(self, folder: Place, journal_offset: int) -> dict[str, Any]:
+        learner = self._calls.start(self._cluster.learner, "save", folder)
         workers = [
-            self._get(worker, "save", folder / f"worker-{i}.safetensors")
+            self._calls.start(worker, "save", inside(folder, f"worker-{i}.safetensors"))
             for i, worker in enumerate(self._cluster.workers)
         ]
         return {
-            "config_hash": config_hash(self._config),
+            "config": to_dict(self._config),
             "env_steps": self.env_steps,
             "updates": self.updates,
             "incarnation": self._incarnation,
             "pacing": self._pacer.state._asdict(),
             "meters": self._meters.get_state(),
-            "due": self._due,
+            "due": dict(self._due),
             "journal_offset": journal_offset,
-            "learner": learner,
-            "workers": workers,
+            "learner": self._calls.get(learner),
+            "workers": [self._calls.get(worker) for worker in workers],
         }
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -246,12 +295,13 @@ class TrainingLoop:
         folder, state = checkpoint
         self._weights = self._get(self._cluster.learner, "load", folder, state["learner"])[0]
         for i, worker in enumerate(self._cluster.workers):
-            self._get(worker, "load", folder / f"worker-{i}.safetensors", state["workers"][i])
+            self._get(worker, "load", inside(folder, f"worker-{i}.safetensors"), state["workers"][i])
         self.env_steps, self.updates = state["env_steps"], state["updates"]
         self._incarnation = state["incarnation"] + 1
         self._pacer.state = PacingState(**state["pacing"])
         self._meters.set_state(state["meters"])
         self._due = dict(state["due"])
+        self._saved, self._saved_at = folder, (self.env_steps, self.updates)
 
     def final_evaluation(self) -> EpisodeStats:
         """Plays the newest weights over `final_eval_episodes`, in parallel tasks."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,8 +13,13 @@ from safetensors.torch import load_file, save_file
 
 from actors.calls import Calls, Node, Ref
 from actors.nodes import ShardNode
+from actors.parts import PartWriter, Written, join_written
+from actors.places import Place, fetched, inside
 from actors.transitions import AddReply, SampleReply, TransitionBlock
 from learner.learner import Learner, LearnerSettings, UpdateStats
+
+WEIGHTS = "learner.safetensors"
+"""File of networks and optimiser in a checkpoint."""
 
 
 class UpdateReport(NamedTuple):
@@ -31,7 +35,7 @@ class LearnerNode:
 
     Args:
       settings: see LearnerSettings.
-      shards: nodes with `sample`, `publish`, `size`, `save`, `load`.
+      shards: nodes with `sample`, `publish`, `size`, `save`, `saved`, `load`.
       shard_calls: how to call the shards.
       calls: how to share weights with rollout workers.
     """
@@ -46,6 +50,7 @@ class LearnerNode:
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence((settings.seed, 1))))
         self._sizes = np.zeros(len(shards), np.float64)
         self._weights: Ref = None
+        self._writer = PartWriter()
         self.publish()
 
     def add(self, block: TransitionBlock) -> AddReply:
@@ -88,29 +93,42 @@ class LearnerNode:
         refs = [self._shard_calls.start(shard, method) for shard in self._shards]
         return [self._shard_calls.get(ref) for ref in refs]
 
-    def save(self, folder: Path) -> dict[str, Any]:
-        """Writes learner and shards into `folder`; returns the rest of their state, for JSON."""
-        save_file(self._learner.get_state(), str(folder / "learner.safetensors"))
+    def save(self, folder: Place) -> dict[str, Any]:
+        """Starts to write learner and shards, as they are now, into `folder`; `saved` tells of its end.
+
+        Returns:
+          The rest of their state, for JSON.
+        """
+        tensors = self._learner.get_state()
+        self._writer.start(inside(folder, WEIGHTS), lambda path: save_file(tensors, str(path)))
         refs = [
-            self._shard_calls.start(shard, "save", folder / f"shard-{i}.zarr") for i, shard in enumerate(self._shards)
+            self._shard_calls.start(shard, "save", inside(folder, f"shard-{i}.zarr"))
+            for i, shard in enumerate(self._shards)
         ]
         shards = [self._shard_calls.get(ref) for ref in refs]
         return {"shards": shards, "rng": self._rng.bit_generator.state, "sizes": self._sizes.tolist()}
 
-    def load(self, folder: Path, state: dict[str, Any]) -> list[Ref]:
+    def saved(self) -> Written | None:
+        """How the last `save` ended, all shards included; None while something of it is being written."""
+        own = self._writer.result()
+        return None if own is None else join_written([own, *self._ask_all("saved")])
+
+    def load(self, folder: Place, state: dict[str, Any]) -> list[Ref]:
         """Takes up what `save` wrote and returned; publishes the weights (see `publish`).
 
         Raises:
           ValueError: the files are damaged or do not fit this run.
         """
+        place = inside(folder, WEIGHTS)
         try:
-            self._learner.set_state(load_file(str(folder / "learner.safetensors")))
+            with fetched(place) as path:
+                self._learner.set_state(load_file(str(path)))
         except (SafetensorError, OSError, KeyError) as error:
-            raise ValueError(f"{folder / 'learner.safetensors'} cannot be read ({error})") from error
+            raise ValueError(f"{place} cannot be read ({error})") from error
         if len(state["shards"]) != len(self._shards):
             raise ValueError(f"the checkpoint has {len(state['shards'])} shards, this run {len(self._shards)}")
         refs = [
-            self._shard_calls.start(shard, "load", folder / f"shard-{i}.zarr", shard_state)
+            self._shard_calls.start(shard, "load", inside(folder, f"shard-{i}.zarr"), shard_state)
             for i, (shard, shard_state) in enumerate(zip(self._shards, state["shards"], strict=True))
         ]
         for ref in refs:

@@ -9,9 +9,12 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from actors.network import QNetwork, WeightsSnapshot, load_snapshot, snapshot
+from actors.places import fetched, inside
 from actors.vector_env import EnvShape
-from learner.checkpoint import Checkpoint, CheckpointError
+from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
+from learner.manifest import CheckpointError, damaged
+from learner.node import WEIGHTS
 
 ONLINE = "online."
 
@@ -22,7 +25,11 @@ def read_policy(checkpoint: Checkpoint, config: RunConfig, shape: EnvShape) -> W
     Raises:
       CheckpointError: the weights do not fit a network of `config` on environments of `shape`.
     """
-    return _read(checkpoint.folder / "learner.safetensors", checkpoint.state["updates"], config, shape)
+    updates = checkpoint.state.get("updates")
+    if type(updates) is not int:
+        raise damaged(checkpoint.folder, "state.json has no number of updates")
+    with fetched(inside(checkpoint.folder, WEIGHTS)) as path:
+        return _read(path, updates, config, shape)
 
 
 def save_policy(path: Path, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> None:
@@ -55,7 +62,7 @@ def _read(path: Path, updates: int, config: RunConfig, shape: EnvShape) -> Weigh
         network.load_state_dict(_online(load_file(str(path))))
     except (RuntimeError, OSError, SafetensorError) as error:
         raise CheckpointError(
-            f"the policy of {path.parent} takes other observations or actions than this setup: name a run whose "
+            f"the policy {path} takes other observations or actions than this setup: name a run whose "
             "sectors, stop_action and hidden_sizes (for M_IN and M_OUT also method and groups) are those of its config"
         ) from error
     return snapshot(network, updates, 0.0)

@@ -5,21 +5,26 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import closing
-from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from actors.network import WeightsSnapshot
+from actors.places import Place
 from actors.transitions import EpisodeStats
-from learner.checkpoint import Checkpoint, CheckpointError, newest_valid
+from learner.checkpoint import Checkpoint, newest_valid
 from learner.cluster import Cluster, process_cluster
-from learner.config import RunConfig, config_hash
+from learner.config import RunConfig
 from learner.journal import Journal, PushedMark, Row
 from learner.loop import TrainingLoop
+from learner.manifest import CheckpointError
 from learner.ray_edge import ray_cluster
 from learner.results import Evaluation, final_metrics, summarise
 from learner.run_folder import RunFolder
+from learner.saved_state import check_config, check_state
 from learner.stopping import stop_on_signals
 from learner.tracker import Tracker
+
+MISFITS = (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError)
+"""What taking up a state of the wrong shape raises; a checksum cannot tell that it was written to do harm."""
 
 
 class Display(Protocol):
@@ -35,10 +40,14 @@ class Display(Protocol):
 
 
 class RunResult(NamedTuple):
-    """How a run ended; `evaluation`, its `episodes` and `weights` are None if a signal stopped it before its end."""
+    """How a run ended; `evaluation`, its `episodes` and `weights` are None if a signal stopped it before its end.
+
+    `checkpoint` is the place of the checkpoint of its end, None if that could not be written.
+    """
 
     env_steps: int
     updates: int
+    checkpoint: Place | None
     stopped_by: int | None
     evaluation: Evaluation | None
     episodes: EpisodeStats | None
@@ -65,10 +74,14 @@ class MirroringObserver:
         """Shows the row."""
         self._display.row(row)
 
-    def checkpoint(self, folder: Path, journal_offset: int) -> None:
+    def checkpoint_failed(self, env_steps: int, reason: str) -> None:
+        """Says so; the next checkpoint is tried as usual."""
+        self._display.message(f"the checkpoint of {env_steps:,} env steps could not be written: {reason}")
+
+    def checkpoint(self, folder: Place, journal_offset: int) -> None:
         """Pushes the rows that the checkpoint covers; what fails is pushed with the next checkpoint."""
         try:
-            self._tracker.push(self._journal.rows(self._pushed.read()))
+            self._tracker.push(self._journal.rows(self._pushed.read(), journal_offset))
         except Exception as error:  # the client raises its own, requests' and SQLAlchemy's errors alike
             self._display.message(f"MLflow did not take the metrics, they will be sent again: {_first_line(error)}")
             return
@@ -90,14 +103,12 @@ def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list
     """The newest usable checkpoint of a run, and why newer ones were skipped.
 
     Raises:
-      CheckpointError: there is none, or it belongs to another config.
+      UselessCheckpointError: there is none, or all are damaged or too old.
+      CheckpointError: it cannot be reached, is of a newer version, or belongs to another config.
     """
-    checkpoint, skipped = newest_valid(folder.checkpoints)
-    if checkpoint.state["config_hash"] != config_hash(config):
-        raise CheckpointError(
-            f"checkpoint {checkpoint.folder} was made with another config than {folder.path / 'config.json'}: "
-            "only total_env_steps and engine may change between two sittings"
-        )
+    checkpoint, skipped = newest_valid(folder.checkpoint_place())
+    check_state(checkpoint)
+    check_config(checkpoint, config, folder.path / "config.json")
     return checkpoint, skipped
 
 
@@ -148,7 +159,7 @@ def execute(
 def _restore(loop: TrainingLoop, checkpoint: Checkpoint) -> None:
     try:
         loop.restore(checkpoint)
-    except ValueError as error:
+    except MISFITS as error:
         cause = getattr(error, "cause", error)  # what a Ray actor raised stands behind Ray's own error
         raise CheckpointError(f"checkpoint {checkpoint.folder} does not fit this run: {cause}") from error
 
@@ -164,12 +175,13 @@ def _train(
 ) -> RunResult:
     observer = MirroringObserver(tracker, journal, PushedMark(folder.pushed, journal.sync()), display)
     with stop_on_signals() as stop:
-        loop = TrainingLoop(config, cluster, journal, folder.checkpoints, observer, stop)
+        storage = folder.storage()
+        loop = TrainingLoop(config, cluster, journal, folder.checkpoint_place(), observer, stop, storage.keep_best)
         if checkpoint is not None:
             _restore(loop, checkpoint)
         finished = loop.run()
         if not finished:
-            return RunResult(loop.env_steps, loop.updates, stop.signal, None, None, None)
+            return RunResult(loop.env_steps, loop.updates, loop.saved, stop.signal, None, None, None)
         display.message(f"training done; evaluating {config.final_eval_episodes} greedy episodes")
         episodes, weights = loop.final_evaluation(), loop.newest_weights()
-        return RunResult(loop.env_steps, loop.updates, None, summarise(episodes), episodes, weights)
+        return RunResult(loop.env_steps, loop.updates, loop.saved, None, summarise(episodes), episodes, weights)

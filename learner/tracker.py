@@ -78,6 +78,7 @@ class Tracker:
         check_reachable(uri)
         self.uri = uri
         self.run_id = ""
+        self._logged: set[tuple[str, int]] = set()
         try:
             self._client = mlflow.MlflowClient(uri)
             found = self._client.get_experiment_by_name(experiment)
@@ -133,13 +134,18 @@ class Tracker:
             ) from error
         self.run_id = run_id
 
+    def skip_what_is_logged(self) -> None:
+        """Lets `push` leave out every metric at a step at which the run has it already."""
+        for key in self._client.get_run(self.run_id).data.metrics:
+            self._logged |= {(key, metric.step) for metric in self._client.get_metric_history(self.run_id, key)}
+
     def push(self, rows: list[Row]) -> None:
         """Mirrors journal rows; a row that is there already is stored once."""
         metrics = [
             Metric(key, value, row.time_ms, row.env_steps)
             for row in rows
             for key, value in row.metrics.items()
-            if math.isfinite(value)
+            if math.isfinite(value) and (key, row.env_steps) not in self._logged
         ]
         for start in range(0, len(metrics), MAX_BATCH):
             self._client.log_batch(self.run_id, metrics=metrics[start : start + MAX_BATCH])

@@ -22,9 +22,10 @@ from actors.network import WeightsSnapshot
 from actors.result_table import LEARNED, ResultRow, read_table, write_table
 from actors.transitions import EpisodeStats
 from actors.vector_env import env_shape
-from learner.checkpoint import Checkpoint, CheckpointError
+from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.journal import Row
+from learner.manifest import UselessCheckpointError
 from learner.policy_file import read_saved_policy, save_policy
 from learner.results import final_metrics, summarise
 from learner.run import RunResult, execute, resume_point
@@ -107,11 +108,17 @@ def _tags(cell: Cell, sweep: SweepConfig) -> dict[str, str]:
     }
 
 
-def _checkpoint(folder: RunFolder, config: RunConfig) -> Checkpoint | None:
+def _checkpoint(folder: RunFolder, config: RunConfig, tracker: Tracker) -> Checkpoint | None:
+    """The newest checkpoint of an earlier attempt; None where there is none of use, and the cell begins anew.
+
+    Raises:
+      CheckpointError: it was made by a newer version or with another config.
+    """
     try:
         return resume_point(folder, config)[0]
-    except CheckpointError:
-        return None  # killed before its first one
+    except UselessCheckpointError:
+        tracker.skip_what_is_logged()  # the same cell makes the same rows again, at another time
+        return None
 
 
 def run_cell(sweep: SweepConfig, cell: Cell, place: SweepPlace, on_row: Callable[[Row], None]) -> Path:
@@ -151,7 +158,7 @@ def _train(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker, 
         tracker.artifact(folder.policy)
         _log_table(results, folder, tracker)
 
-    execute(folder, cell.config, tracker, RowDisplay(on_row), _checkpoint(folder, cell.config), None, finish)
+    execute(folder, cell.config, tracker, RowDisplay(on_row), _checkpoint(folder, cell.config, tracker), None, finish)
 
 
 def _fixed_seeds(cell: Cell) -> list[int]:

@@ -157,7 +157,7 @@ class TestWithARun:
             path.write_bytes(data)
         code, error = run(capsys, "evaluate", "r", "--runs-dir", str(runs))
         assert code == 2
-        assert "damaged (learner.safetensors)" in error
+        assert "damaged (learner.safetensors: its content has another checksum)" in error
 
     def test_one_damaged_checkpoint_is_skipped_and_said(self, capsys, runs):
         newest = max((runs / "r" / "checkpoints").iterdir())

@@ -27,6 +27,9 @@ class Silent:
     def checkpoint(self, folder, journal_offset):
         pass
 
+    def checkpoint_failed(self, env_steps, reason):
+        raise AssertionError(reason)
+
 
 class Listing(Silent):
     def __init__(self):

@@ -1,12 +1,15 @@
 """Reading a policy from a checkpoint."""
 
+import time
+
 import numpy as np
 import pytest
 
 from actors.vector_env import env_shape
-from learner.checkpoint import CheckpointError, read_checkpoint, write_checkpoint
+from learner.checkpoint import Checkpoint
 from learner.cluster import process_cluster
 from learner.config import RunConfig
+from learner.manifest import CheckpointError
 from learner.policy_file import read_policy
 from sim_core.config import WorldConfig
 
@@ -15,12 +18,10 @@ from sim_core.config import WorldConfig
 def saved(tmp_path, small_run):
     """A checkpoint of a learner, and the weights that it published."""
     learner = process_cluster(small_run, 0).learner
-
-    def save(folder):
-        return {"learner": learner.save(folder), "updates": 42}
-
-    checkpoint = read_checkpoint(write_checkpoint(tmp_path, 7, save))
-    return checkpoint, learner.weights()[0].value
+    learner.save(tmp_path)
+    while learner.saved() is None:
+        time.sleep(0.005)
+    return Checkpoint(tmp_path, {"updates": 42}), learner.weights()[0].value
 
 
 def test_the_policy_is_the_published_one(saved, small_run):
