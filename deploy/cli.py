@@ -114,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return execute(parse(sys.argv[1:] if arguments is None else arguments))
     except ConfigError as error:
-        print(f"shoal: {error}", file=sys.stderr)
+        print(f"shoal: {' '.join(str(error).splitlines())}", file=sys.stderr)  # names may hold line breaks
         return BAD_INPUT
     except KeyboardInterrupt:
         print("shoal: interrupted", file=sys.stderr)

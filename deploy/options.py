@@ -145,7 +145,7 @@ class Evaluate:
     """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
 
     def __post_init__(self) -> None:
-        require(self.episodes >= 1, f"--episodes must be at least 1, not {self.episodes}")
+        require(1 <= self.episodes <= 10**7, f"--episodes must be in 1..{10**7}, not {self.episodes}")
         require(
             0 <= self.first_seed <= 2**32 - 1 - self.episodes,
             f"--first-seed must be in 0..{2**32 - 1 - self.episodes}, not {self.first_seed}",

@@ -15,8 +15,10 @@ from deploy.folders import check_plain_name, make_folder, new_storage
 from deploy.options import Launch, Resume, Train, ray_address
 from deploy.progress import make_display
 from deploy.tables import evaluation_table, summary_lines
+from learner.addresses import full_uri, public_uri
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
+from learner.footprint import check_fits
 from learner.journal import Row
 from learner.run import RunResult, execute, resume_point
 from learner.run_folder import RunFolder, RunIdentity, find_run
@@ -42,13 +44,16 @@ def train(command: Train) -> int:
         check_plain_name(launch.name)
     folder = _new_folder(config, launch)
     make_folder(launch.runs_dir, "--runs-dir")
-    env_shape(config.env)  # refuses an environment that cannot be made
+    if launch.ray_address() is None:
+        check_fits(config)
+    else:
+        env_shape(config.env)  # refuses an environment that cannot be made
     storage = new_storage(command.checkpoint_url, folder.path.name, command.keep_best)
     tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
     tracker.start(config)
     folder.save_storage(storage)
     folder.save_config(config)
-    folder.save_identity(RunIdentity(config.name, tracker.uri, launch.experiment, tracker.run_id))
+    folder.save_identity(RunIdentity(config.name, public_uri(tracker.uri), launch.experiment, tracker.run_id))
     return _run(folder, config, tracker, None, launch.ray_address())
 
 
@@ -58,7 +63,7 @@ def resume(command: Resume) -> int:
     config, identity = folder.config(), folder.identity()
     checkpoint, skipped = resume_point(folder, config)
     config = _extended(config, command.total_env_steps, checkpoint.state["env_steps"])
-    tracker = Tracker(identity.tracking_uri, identity.experiment, None)
+    tracker = Tracker(full_uri(identity.tracking_uri), identity.experiment, None)
     tracker.resume(identity.mlflow_run_id)
     folder.save_config(config)
     console = Console()
@@ -98,7 +103,7 @@ def _run(
         console.print(f"go on with: {resume_command(folder)}", highlight=False, soft_wrap=True)
         return 128 + (result.stopped_by or 0)
     console.print(evaluation_table(result.evaluation, config.name))
-    for line in summary_lines(folder, result, tracker.uri, config.env.is_swarm):
+    for line in summary_lines(folder, result, public_uri(tracker.uri), config.env.is_swarm):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     return 0
 

@@ -109,6 +109,13 @@ class TrainingLoop:
         Raises:
           RuntimeError: nothing is under way and nothing may start.
         """
+        try:
+            return self._run()
+        except Exception:
+            self._checkpointer.wait()  # what writes must not outlive its run: another attempt may begin at once
+            raise
+
+    def _run(self) -> bool:
         if self._weights is None:
             self._send_first_weights()
         self._meters.start_clock()

@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 from actors.network import WeightsSnapshot
 from actors.places import Place
 from actors.transitions import EpisodeStats
+from learner.addresses import hide_secrets
 from learner.checkpoint import Checkpoint, newest_valid
 from learner.cluster import Cluster, process_cluster
 from learner.config import RunConfig
@@ -83,7 +84,8 @@ class MirroringObserver:
         try:
             self._tracker.push(self._journal.rows(self._pushed.read(), journal_offset))
         except Exception as error:  # the client raises its own, requests' and SQLAlchemy's errors alike
-            self._display.message(f"MLflow did not take the metrics, they will be sent again: {_first_line(error)}")
+            reason = hide_secrets(_first_line(error), self._tracker.uri)
+            self._display.message(f"MLflow did not take the metrics, they will be sent again: {reason}")
             return
         self._pushed.write(journal_offset)
 

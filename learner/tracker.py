@@ -18,6 +18,7 @@ import torch
 
 from actors.network import QNetwork, WeightsSnapshot, load_snapshot
 from actors.vector_env import EnvShape
+from learner.addresses import hide_secrets, public_uri
 from learner.config import RunConfig, config_hash
 from learner.journal import Row
 from learner.views import TAG, packed_view, sweep_views
@@ -47,15 +48,15 @@ def flat_params(config: RunConfig) -> dict[str, Any]:
 
 def check_reachable(uri: str) -> None:
     """Raises ConfigError unless a server answers where `uri` is an address; local stores pass."""
-    parts = urlsplit(uri)
-    if parts.scheme not in ("http", "https"):
-        return
-    port = parts.port or (443 if parts.scheme == "https" else 80)
     try:
+        parts = urlsplit(uri)
+        if parts.scheme not in ("http", "https"):
+            return
+        port = parts.port or (443 if parts.scheme == "https" else 80)
         socket.create_connection((parts.hostname or "", port), CONNECT_TIMEOUT_S).close()
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: no address at all
         raise ConfigError(
-            f"no MLflow server answers at {uri} ({error}); start one with `mlflow server`, "
+            f"no MLflow server answers at {public_uri(uri)} ({error}); start one with `mlflow server`, "
             "or leave --tracking-uri out to log to a local file"
         ) from error
 
@@ -85,10 +86,10 @@ class Tracker:
             self._experiment_id = (
                 found.experiment_id if found else self._client.create_experiment(experiment, artifact_root)
             )
-        except (MlflowException, SQLAlchemyError, OSError) as error:
-            first_line = str(error).splitlines()[0]
+        except (MlflowException, SQLAlchemyError, OSError, ValueError, ImportError) as error:
+            first_line = hide_secrets((str(error).splitlines() or [type(error).__name__])[0], uri)
             raise ConfigError(
-                f"the MLflow store {uri} cannot be opened ({first_line}); name another --tracking-uri"
+                f"the MLflow store {public_uri(uri)} cannot be opened ({first_line}); name another --tracking-uri"
             ) from error
 
     def start(self, config: RunConfig, tags: dict[str, str] | None = None) -> None:
@@ -130,7 +131,7 @@ class Tracker:
             self._client.log_batch(run_id, tags=[RunTag("attempts", str(attempts + 1))])
         except MlflowException as error:
             raise ConfigError(
-                f"the MLflow store {self.uri} does not know run {run_id}; name the store it was logged to"
+                f"the MLflow store {public_uri(self.uri)} does not know run {run_id}; name the store it was logged to"
             ) from error
         self.run_id = run_id
 
@@ -196,5 +197,8 @@ class Tracker:
 def git_commit() -> str:
     """The commit of the checkout that this module lies in; `unknown` outside one."""
     here = Path(__file__).parent
-    done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False)
+    try:
+        done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False)
+    except OSError:  # no git
+        return "unknown"
     return done.stdout.strip() or "unknown"

@@ -22,6 +22,7 @@ from actors.network import WeightsSnapshot
 from actors.result_table import LEARNED, ResultRow, read_table, write_table
 from actors.transitions import EpisodeStats
 from actors.vector_env import env_shape
+from learner.addresses import public_uri
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.journal import Row
@@ -94,7 +95,7 @@ def _start_or_find(cell: Cell, sweep: SweepConfig, folder: RunFolder, place: Swe
     else:
         tracker.start(cell.config, _tags(cell, sweep))
     folder.save_config(cell.config)
-    folder.save_identity(RunIdentity(cell.name, tracker.uri, place.experiment, tracker.run_id))
+    folder.save_identity(RunIdentity(cell.name, public_uri(tracker.uri), place.experiment, tracker.run_id))
     return tracker
 
 
@@ -108,7 +109,7 @@ def _tags(cell: Cell, sweep: SweepConfig) -> dict[str, str]:
     }
 
 
-def _checkpoint(folder: RunFolder, config: RunConfig, tracker: Tracker) -> Checkpoint | None:
+def _checkpoint(folder: RunFolder, config: RunConfig) -> Checkpoint | None:
     """The newest checkpoint of an earlier attempt; None where there is none of use, and the cell begins anew.
 
     Raises:
@@ -117,7 +118,6 @@ def _checkpoint(folder: RunFolder, config: RunConfig, tracker: Tracker) -> Check
     try:
         return resume_point(folder, config)[0]
     except UselessCheckpointError:
-        tracker.skip_what_is_logged()  # the same cell makes the same rows again, at another time
         return None
 
 
@@ -136,20 +136,30 @@ def run_cell(sweep: SweepConfig, cell: Cell, place: SweepPlace, on_row: Callable
     folder = RunFolder(place.cells / cell.key)
     if folder.results.is_file() and done_cells(sweep, [cell], read_table(folder.results)):
         return folder.results
+    checkpoint = _checkpoint(folder, cell.config)
     tracker = _start_or_find(cell, sweep, folder, place)
     if cell.policy != LEARNED:
         _play_baseline(sweep, cell, folder, tracker)
     elif folder.policy.is_file() and not folder.checkpoints.exists():
         _play_again(sweep, cell, folder, tracker)
     else:
-        _train(sweep, cell, folder, tracker, on_row)
+        _train(sweep, cell, folder, tracker, checkpoint, on_row)
     _new_table(folder).rename(folder.results)  # once MLflow has all and its run is closed
     shutil.rmtree(folder.checkpoints, ignore_errors=True)  # the policy and the results stay
     return folder.results
 
 
-def _train(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker, on_row: Callable[[Row], None]) -> None:
-    """Trains from the newest checkpoint, and evaluates the policy."""
+def _train(
+    sweep: SweepConfig,
+    cell: Cell,
+    folder: RunFolder,
+    tracker: Tracker,
+    checkpoint: Checkpoint | None,
+    on_row: Callable[[Row], None],
+) -> None:
+    """Trains from a checkpoint or the start, and evaluates the policy."""
+    if checkpoint is None:
+        tracker.skip_what_is_logged()  # the same cell makes the same rows again, at another time
 
     def finish(result: RunResult, rows: list[Row]) -> None:
         assert result.weights is not None and result.episodes is not None
@@ -158,7 +168,7 @@ def _train(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker, 
         tracker.artifact(folder.policy)
         _log_table(results, folder, tracker)
 
-    execute(folder, cell.config, tracker, RowDisplay(on_row), _checkpoint(folder, cell.config, tracker), None, finish)
+    execute(folder, cell.config, tracker, RowDisplay(on_row), checkpoint, None, finish)
 
 
 def _fixed_seeds(cell: Cell) -> list[int]:
