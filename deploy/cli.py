@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import tomllib
@@ -21,6 +22,8 @@ from sim_core.checks import ConfigError, require  # noqa: E402
 
 BAD_INPUT = 2
 INTERRUPTED = 130
+BAD_NAMES = (errno.ENAMETOOLONG, errno.EILSEQ, errno.ELOOP)
+"""Errors of paths that no file can have, wherever a command first looks at them."""
 
 
 def read_config_file(path: Path) -> RunConfig:
@@ -116,9 +119,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         print(f"shoal: {' '.join(str(error).splitlines())}", file=sys.stderr)  # names may hold line breaks
         return BAD_INPUT
-    except KeyboardInterrupt:
-        print("shoal: interrupted", file=sys.stderr)
-        return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:
+        if error.errno not in BAD_NAMES:
+            raise
+        name = str(error.filename)
+        short = name if len(name) <= 60 else f"{name[:60]}..."
+        print(f"shoal: {short!r} cannot name a file ({error.strerror}); choose another name", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("shoal: interrupted", file=sys.stderr)
+        return INTERRUPTED

@@ -307,7 +307,7 @@ class TrainingLoop:
         self._incarnation = state["incarnation"] + 1
         self._pacer.state = PacingState(**state["pacing"])
         self._meters.set_state(state["meters"])
-        self._due = dict(state["due"])
+        self._due = {what: int(state["due"][what]) for what in self._due}
         self._saved, self._saved_at = folder, (self.env_steps, self.updates)
 
     def final_evaluation(self) -> EpisodeStats:
