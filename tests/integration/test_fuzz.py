@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from tests.integration.fuzzing import KINDS, workplace
+from tests.integration.fuzzing import KINDS, check, workplace
 
 CASES = 120
 
@@ -16,13 +16,37 @@ def closed(tmp_path_factory):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_any_input_is_taken_or_refused_with_a_sentence(kind):
-    cases, check = KINDS[kind]
+    cases, check_case = KINDS[kind]
     outcomes = set()
 
     @given(cases)
     @settings(max_examples=CASES, deadline=None, suppress_health_check=list(HealthCheck))
     def fuzz(case):
-        outcomes.add(check(case).outcome)
+        outcomes.add(check_case(case).outcome)
 
     fuzz()
     assert "refused" in outcomes
+
+
+LONG = "x" * 5_000
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["resume", LONG],
+        ["evaluate", LONG],
+        ["evaluate", "greedy", "--out", f"{LONG}.zarr"],
+        ["train", "--name", LONG],
+        ["train", "--runs-dir", LONG],
+        ["train", "--runs-dir", "a-file/x"],
+        ["train", "--replay-capacity", "1000000000000"],
+        ["train", "--checkpoint-url", "nosuch://x"],
+        ["train", "--checkpoint-url", "a-file/x"],
+        ["train", "--config", "a-file"],
+        ["resume", "line\nbreak"],
+    ],
+    ids=lambda arguments: " ".join(arguments)[:40],
+)
+def test_what_was_found_stays_refused(arguments):
+    assert check(arguments).outcome == "refused"
