@@ -17,9 +17,9 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from actors.calls import Calls, Node, Ref
+from actors.locations import Location, fetched
 from actors.network import WeightsSnapshot
 from actors.parts import PartWriter, Written
-from actors.places import Place, fetched
 from actors.replay import ReplayShard
 from actors.rollout import RolloutSettings, RolloutWorker
 from actors.storage import save_rows
@@ -61,8 +61,8 @@ class ShardNode:
         """Transitions held."""
         return self.shard.size
 
-    def save(self, place: Place) -> dict[str, Any]:
-        """Starts to write the shard's rows as they are now to a zarr group at `place`; `saved` tells of its end.
+    def save(self, location: Location) -> dict[str, Any]:
+        """Starts to write the shard's rows as they are now to a zarr group at `location`; `saved` tells of its end.
 
         Returns:
           The state that belongs to them, for JSON.
@@ -73,16 +73,16 @@ class ShardNode:
             with closing(rows):
                 save_rows(path, rows)
 
-        self._writer.start(place, write)
+        self._writer.start(location, write)
         return self.shard.get_state()
 
     def saved(self) -> Written | None:
         """How the last `save` ended; None while it is being written."""
         return self._writer.result()
 
-    def load(self, place: Place, state: dict[str, Any]) -> None:
+    def load(self, location: Location, state: dict[str, Any]) -> None:
         """Takes up what `save` wrote and returned (see ReplayShard.load)."""
-        with fetched(place) as path:
+        with fetched(location) as path:
             self.shard.load(path, state)
 
 
@@ -155,8 +155,8 @@ class RolloutNode:
             staleness_s=time.time() - block.header.policy_time_s,
         )
 
-    def save(self, place: Place) -> dict[str, Any]:
-        """Starts to write the worker's arrays as they are now to the file `place`; `saved` tells of its end.
+    def save(self, location: Location) -> dict[str, Any]:
+        """Starts to write the worker's arrays as they are now to the file `location`; `saved` tells of its end.
 
         Returns:
           The rest of its state, for JSON.
@@ -167,23 +167,23 @@ class RolloutNode:
         if self._pushes:
             raise RuntimeError("settle before the state is saved: pushes are under way")
         state = self._worker.get_state()
-        self._writer.start(place, lambda path: save_file(state["arrays"], str(path)))
+        self._writer.start(location, lambda path: save_file(state["arrays"], str(path)))
         return {**state["meta"], "next_shard": self._next_shard}
 
     def saved(self) -> Written | None:
         """How the last `save` ended; None while it is being written."""
         return self._writer.result()
 
-    def load(self, place: Place, state: dict[str, Any]) -> None:
+    def load(self, location: Location, state: dict[str, Any]) -> None:
         """Takes up what `save` wrote and returned.
 
         Raises:
           ValueError: the file is damaged or does not fit.
         """
         try:
-            with fetched(place) as path:
+            with fetched(location) as path:
                 arrays = load_file(str(path))
         except (SafetensorError, OSError) as error:
-            raise ValueError(f"{place} cannot be read ({error})") from error
+            raise ValueError(f"{location} cannot be read ({error})") from error
         self._next_shard = state["next_shard"] % len(self._shards)
         self._worker.set_state(arrays, state)

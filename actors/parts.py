@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from actors.places import Place, files_under, staged
+from actors.locations import Location, files_under, staged
 
 
 class FileSum(NamedTuple):
@@ -44,11 +44,11 @@ class PartWriter:
         self._is_blocked = False
         self._written = Written({}, "nothing was being written: the process is a new one")
 
-    def start(self, place: Place, write: Callable[[Path], None]) -> None:
-        """Starts writing the file or folder at `place`.
+    def start(self, location: Location, write: Callable[[Path], None]) -> None:
+        """Starts writing the file or folder at `location`.
 
         Args:
-          place: where it will be.
+          location: where it will be.
           write: writes it to the path that it is given, from data that nobody changes meanwhile.
 
         Where an earlier part is still being written, this one fails at once.
@@ -56,15 +56,15 @@ class PartWriter:
         self._is_blocked = self._thread is not None and self._thread.is_alive()
         if self._is_blocked:
             return
-        self._thread = threading.Thread(target=self._write, args=(place, write), name="shoal-part", daemon=True)
+        self._thread = threading.Thread(target=self._write, args=(location, write), name="shoal-part", daemon=True)
         self._thread.start()
 
-    def _write(self, place: Place, write: Callable[[Path], None]) -> None:
+    def _write(self, location: Location, write: Callable[[Path], None]) -> None:
         try:
-            with staged(place) as local:
+            with staged(location) as local:
                 write(local)
                 files = {name: file_sum(path) for name, path in files_under(local).items()}
-                if local is place:
+                if local is location:
                     sync_all(local)
             self._written = Written(files, None)
         except Exception as error:  # whatever a disk, a storage's client or a format raises: the run goes on

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from actors.places import as_place, check_writable, inside
+from actors.locations import as_location, check_writable, inside
 from learner.checkpoint_store import open_store
 from learner.run_folder import Storage
 from sim_core.checks import ConfigError, require
@@ -32,18 +32,20 @@ def new_storage(checkpoint_url: str | None, name: str, keep_best: int) -> Storag
     """
     if checkpoint_url is None:
         return Storage(None, keep_best)
-    root = as_place(checkpoint_url)
+    root = as_location(checkpoint_url)
     if isinstance(root, Path):
         make_folder(root, "--checkpoint-url")
     else:
         check_writable(root)
-    place = inside(root, name)
+    location = inside(root, name)
     try:
-        taken = open_store(place).names()
+        taken = open_store(location).names()
     except OSError as error:
-        raise ConfigError(f"--checkpoint-url {place} cannot be listed ({error}); name another one") from error
-    require(not taken, f"--checkpoint-url {place} holds the checkpoints of another run; choose another --name or URL")
-    return Storage(str(place), keep_best)
+        raise ConfigError(f"--checkpoint-url {location} cannot be listed ({error}); name another one") from error
+    require(
+        not taken, f"--checkpoint-url {location} holds the checkpoints of another run; choose another --name or URL"
+    )
+    return Storage(str(location), keep_best)
 
 
 def check_plain_name(name: str) -> None:

@@ -50,9 +50,9 @@ def _load(folder: RunFolder, config: RunConfig, which: str) -> WeightsSnapshot:
     is_swept = folder.results.is_file() or not (folder.checkpoints.exists() or folder.storage().checkpoint_url)
     if folder.policy.is_file() and is_swept:  # of a cell that is done, only the policy is kept
         return read_saved_policy(folder.policy, config, shape)
-    place = folder.checkpoint_place()
+    location = folder.checkpoint_location()
     scores = scores_of(journal_rows(folder.journal)) if which == "best" else None
-    checkpoint, skipped = newest_valid(place) if scores is None else best_valid(place, scores)
+    checkpoint, skipped = newest_valid(location) if scores is None else best_valid(location, scores)
     for reason in skipped:
         Console(stderr=True).print(f"skipped: {reason}", markup=False, highlight=False, soft_wrap=True)
     return read_policy(checkpoint, config, shape)

@@ -9,8 +9,8 @@ import hashlib
 import json
 from typing import Any, NamedTuple
 
+from actors.locations import Location
 from actors.parts import FileSum
-from actors.places import Place
 from learner.checkpoint_store import CheckpointStore, Sized, env_steps_of, open_store
 from learner.manifest import (
     MANIFEST,
@@ -32,7 +32,7 @@ READ_BYTES = 2**20
 class Checkpoint(NamedTuple):
     """A verified checkpoint: where its files lie, and the state of `state.json`."""
 
-    folder: Place
+    folder: Location
     state: dict[str, Any]
 
 
@@ -45,8 +45,8 @@ class Keep(NamedTuple):
 
 
 def complete_checkpoint(
-    store: CheckpointStore, draft: Place, env_steps: int, state: dict[str, Any], files: dict[str, FileSum]
-) -> Place:
+    store: CheckpointStore, draft: Location, env_steps: int, state: dict[str, Any], files: dict[str, FileSum]
+) -> Location:
     """Makes a draft with all parts written a checkpoint.
 
     Args:
@@ -57,7 +57,7 @@ def complete_checkpoint(
       files: the parts' files.
 
     Returns:
-      The checkpoint's place.
+      The checkpoint's location.
 
     Raises:
       OSError: the storage does not take it; older checkpoints stay as they were.
@@ -65,16 +65,16 @@ def complete_checkpoint(
     text = json.dumps(state).encode()
     own = FileSum(len(text), hashlib.sha256(text).hexdigest())
     manifest = encode_manifest(env_steps, {**files, STATE: own})
-    return store.place(store.complete(draft, {STATE: text, MANIFEST: manifest}))
+    return store.location(store.complete(draft, {STATE: text, MANIFEST: manifest}))
 
 
-def keep_checkpoints(store: CheckpointStore, last: Place, keep: Keep) -> None:
+def keep_checkpoints(store: CheckpointStore, last: Location, keep: Keep) -> None:
     """Removes all checkpoints but those to keep, and what crashed writers left.
 
     What calls itself newer than `last`, the one just written, was skipped when the run was resumed: it goes too.
     """
     names = store.names()
-    own = names[[store.place(name) for name in names].index(last) :]
+    own = names[[store.location(name) for name in names].index(last) :]
     kept = names_to_keep([(name, env_steps_of(name)) for name in own], keep.newest, keep.best, keep.scores)
     store.remove([name for name in names if name not in kept])
 
@@ -86,27 +86,27 @@ def read_checkpoint(store: CheckpointStore, name: str) -> Checkpoint:
       UselessCheckpointError: it is incomplete, damaged, or of an older format.
       CheckpointError: it is of a newer format.
     """
-    place = store.place(name)
-    manifest = decode_manifest(_small_file(store, name, MANIFEST), place)
+    location = store.location(name)
+    manifest = decode_manifest(_small_file(store, name, MANIFEST), location)
     _verify(store, name, manifest)
     state = parse_object(_small_file(store, name, STATE))
     if state is None:
-        raise damaged(place, f"{STATE} is no JSON object")
-    return Checkpoint(place, state)
+        raise damaged(location, f"{STATE} is no JSON object")
+    return Checkpoint(location, state)
 
 
 def _open(store: CheckpointStore, name: str, file: str) -> Sized:
     try:
         return store.open(name, file)
     except (OSError, ValueError) as error:
-        raise damaged(store.place(name), f"{file}: {error}") from error
+        raise damaged(store.location(name), f"{file}: {error}") from error
 
 
 def _small_file(store: CheckpointStore, name: str, file: str) -> bytes:
     opened, size = _open(store, name, file)
     with opened:
         if size > MOST_BYTES:
-            raise damaged(store.place(name), f"{file} has {size} bytes, more than {MOST_BYTES}")
+            raise damaged(store.location(name), f"{file} has {size} bytes, more than {MOST_BYTES}")
         return opened.read(MOST_BYTES)
 
 
@@ -115,18 +115,18 @@ def _verify(store: CheckpointStore, name: str, manifest: Manifest) -> None:
         opened, size = _open(store, name, file)
         with opened:
             if size != expected.size:
-                raise damaged(store.place(name), f"{file}: {size} bytes, not {expected.size}")
+                raise damaged(store.location(name), f"{file}: {size} bytes, not {expected.size}")
             digest = hashlib.sha256()
             try:
                 while block := opened.read(READ_BYTES):
                     digest.update(block)
             except OSError as error:
-                raise damaged(store.place(name), f"{file}: {error}") from error
+                raise damaged(store.location(name), f"{file}: {error}") from error
         if digest.hexdigest() != expected.sha256:
-            raise damaged(store.place(name), f"{file}: its content has another checksum")
+            raise damaged(store.location(name), f"{file}: its content has another checksum")
 
 
-def newest_valid(root: Place) -> tuple[Checkpoint, list[str]]:
+def newest_valid(root: Location) -> tuple[Checkpoint, list[str]]:
     """The newest checkpoint that passes, and why newer ones were skipped.
 
     Raises:
@@ -137,7 +137,7 @@ def newest_valid(root: Place) -> tuple[Checkpoint, list[str]]:
     return _first_valid(root, store, names)
 
 
-def best_valid(root: Place, scores: list[Scored]) -> tuple[Checkpoint, list[str]]:
+def best_valid(root: Location, scores: list[Scored]) -> tuple[Checkpoint, list[str]]:
     """The checkpoint that did best in the evaluations during training and passes, and why better ones were skipped.
 
     Raises:
@@ -150,7 +150,7 @@ def best_valid(root: Place, scores: list[Scored]) -> tuple[Checkpoint, list[str]
     return _first_valid(root, store, best)
 
 
-def _listed(root: Place) -> tuple[CheckpointStore, list[str]]:
+def _listed(root: Location) -> tuple[CheckpointStore, list[str]]:
     try:
         store = open_store(root)
         return store, store.names()
@@ -158,7 +158,7 @@ def _listed(root: Place) -> tuple[CheckpointStore, list[str]]:
         raise CheckpointError(f"the checkpoints at {root} cannot be listed: {error}") from error
 
 
-def _first_valid(root: Place, store: CheckpointStore, names: list[str]) -> tuple[Checkpoint, list[str]]:
+def _first_valid(root: Location, store: CheckpointStore, names: list[str]) -> tuple[Checkpoint, list[str]]:
     skipped: list[CheckpointError] = []
     for name in names:
         try:

@@ -12,8 +12,8 @@ import stat
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Protocol
 
+from actors.locations import Location, filesystem, storage_errors
 from actors.parts import sync_all
-from actors.places import Place, filesystem, storage_errors
 from learner.manifest import MANIFEST
 
 PREFIX = "step-"
@@ -35,7 +35,7 @@ class CheckpointStore(Protocol):
         """Names of finished checkpoints, newest first."""
         ...
 
-    def place(self, name: str) -> Place:
+    def location(self, name: str) -> Location:
         """Where a checkpoint's files lie."""
         ...
 
@@ -43,11 +43,11 @@ class CheckpointStore(Protocol):
         """Opens one file of a checkpoint; whatever is no plain file of its folder is refused with an OSError."""
         ...
 
-    def draft(self, env_steps: int) -> Place:
+    def draft(self, env_steps: int) -> Location:
         """Where the files of a new checkpoint are to be written before `complete`; asks no storage."""
         ...
 
-    def complete(self, draft: Place, last: dict[str, bytes]) -> str:
+    def complete(self, draft: Location, last: dict[str, bytes]) -> str:
         """Adds small files in order, the manifest last, and makes the draft a checkpoint; returns its name."""
         ...
 
@@ -70,8 +70,8 @@ def _age(name: str) -> tuple[int, int]:
     return int(match[1]), -1 if match[2] == "old" else int(match[2] or 0)
 
 
-def open_store(root: Place) -> CheckpointStore:
-    """The checkpoints at a place.
+def open_store(root: Location) -> CheckpointStore:
+    """The checkpoints at a location.
 
     Raises:
       ConfigError: nothing here speaks the URL's protocol.
@@ -92,7 +92,7 @@ class FolderStore:
         kept = (name for name in found if not name.endswith(".old") or name.removesuffix(".old") not in found)
         return sorted(kept, key=_age, reverse=True)
 
-    def place(self, name: str) -> Path:
+    def location(self, name: str) -> Path:
         """The checkpoint's folder."""
         return self._root / name
 
@@ -114,7 +114,7 @@ class FolderStore:
         shutil.rmtree(part, ignore_errors=True)
         return part
 
-    def complete(self, draft: Place, last: dict[str, bytes]) -> str:
+    def complete(self, draft: Location, last: dict[str, bytes]) -> str:
         """Syncs the small files and the folders, then renames; an older one of the same name is replaced."""
         assert isinstance(draft, Path)
         for name, content in last.items():
@@ -172,7 +172,7 @@ class UrlStore:
         found = {part[0] for part in parts if len(part) == 2 and part[1] == MANIFEST and NAME.fullmatch(part[0])}
         return sorted(found, key=_age, reverse=True)
 
-    def place(self, name: str) -> str:
+    def location(self, name: str) -> str:
         """The checkpoint's URL."""
         return f"{self._url}/{name}"
 
@@ -192,7 +192,7 @@ class UrlStore:
         self._taken.add(name)
         return f"{self._url}/{name}"
 
-    def complete(self, draft: Place, last: dict[str, bytes]) -> str:
+    def complete(self, draft: Location, last: dict[str, bytes]) -> str:
         """Writes the small files, one after the other."""
         name = str(draft).rsplit("/", 1)[1]
         with storage_errors(draft):

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from actors.calls import Calls, Node
+from actors.locations import Location
 from actors.parts import FileSum, Written, join_written
-from actors.places import Place
 from learner.checkpoint import Keep, complete_checkpoint, keep_checkpoints
 from learner.checkpoint_store import open_store
 
@@ -32,10 +32,10 @@ class Moment(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """How a checkpoint ended: its moment, and its place or else why it could not be written."""
+    """How a checkpoint ended: its moment, and its location or else why it could not be written."""
 
     moment: Moment
-    place: Place | None
+    location: Location | None
     error: str | None
 
 
@@ -47,7 +47,7 @@ class Checkpointer:
       calls: how to call the nodes, from another thread too.
     """
 
-    def __init__(self, root: Place, calls: Calls) -> None:
+    def __init__(self, root: Location, calls: Calls) -> None:
         self._store = open_store(root)
         self._calls = calls
         self._thread: threading.Thread | None = None
@@ -58,12 +58,12 @@ class Checkpointer:
         """Whether a checkpoint is being written, or its end has not been asked for."""
         return self._thread is not None
 
-    def draft(self, env_steps: int) -> Place:
+    def draft(self, env_steps: int) -> Location:
         """Where the nodes are to write their parts of the next checkpoint."""
         return self._store.draft(env_steps)
 
     def begin(
-        self, moment: Moment, draft: Place, state: dict[str, Any], nodes: dict[str, Node], seal: Callable[[], Keep]
+        self, moment: Moment, draft: Location, state: dict[str, Any], nodes: dict[str, Node], seal: Callable[[], Keep]
     ) -> None:
         """Goes on in the background, once every node has begun to save.
 
@@ -82,14 +82,14 @@ class Checkpointer:
         self._thread.start()
 
     def _write(
-        self, moment: Moment, draft: Place, state: dict[str, Any], nodes: dict[str, Node], seal: Callable[[], Keep]
+        self, moment: Moment, draft: Location, state: dict[str, Any], nodes: dict[str, Node], seal: Callable[[], Keep]
     ) -> None:
         try:
             files = self._parts(nodes)
             keep = seal()
-            place = complete_checkpoint(self._store, draft, moment.env_steps, state, files)
-            self._ended = Ended(moment, place, None)
-            keep_checkpoints(self._store, place, keep)
+            location = complete_checkpoint(self._store, draft, moment.env_steps, state, files)
+            self._ended = Ended(moment, location, None)
+            keep_checkpoints(self._store, location, keep)
         except Exception as error:  # a disk's, a storage client's, Ray's: each raises its own, and training goes on
             reason = (str(error).splitlines() or [""])[0] or type(error).__name__
             self._ended = self._ended or Ended(moment, None, reason)

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple, Protocol
 from actors.calls import Ref
 from actors.evaluator import evaluate, evaluate_in_parts
 from actors.exploration import epsilon
+from actors.locations import Location, inside
 from actors.network import WeightsSnapshot
-from actors.places import Place, inside
 from actors.transitions import BlockReport, EpisodeStats
 from learner.checkpoint import Checkpoint, Keep
 from learner.checkpointer import Checkpointer, Ended, Moment
@@ -37,7 +37,7 @@ class Observer(Protocol):
         """A row of metrics was written."""
         ...
 
-    def checkpoint(self, folder: Place, journal_offset: int) -> None:
+    def checkpoint(self, folder: Location, journal_offset: int) -> None:
         """A checkpoint is whole; rows up to the offset are covered by it."""
         ...
 
@@ -72,7 +72,7 @@ class TrainingLoop:
         config: RunConfig,
         cluster: Cluster,
         journal: Journal,
-        checkpoints: Place,
+        checkpoints: Location,
         observer: Observer,
         stop: Callable[[], bool],
         keep_best: int = 0,
@@ -94,7 +94,7 @@ class TrainingLoop:
         self._incarnation = 0
         self.env_steps = 0
         self.updates = 0
-        self._saved: Place | None = None
+        self._saved: Location | None = None
         self._saved_at: tuple[int, int] | None = None
         self._due = {"log": config.log_every_env_steps, "eval": config.eval_every_env_steps}
         self._due["checkpoint"] = config.checkpoint_every_env_steps
@@ -228,7 +228,7 @@ class TrainingLoop:
             self._take_blocks(self._get(worker, "settle"))
 
     @property
-    def saved(self) -> Place | None:
+    def saved(self) -> Location | None:
         """The checkpoint of this very moment; None if it has not been written."""
         return self._saved if self._saved_at == (self.env_steps, self.updates) else None
 
@@ -249,11 +249,11 @@ class TrainingLoop:
     def _take_checkpoint(self, ended: Ended | None) -> None:
         if ended is None:
             return
-        if ended.place is None:
+        if ended.location is None:
             self._observer.checkpoint_failed(ended.moment.env_steps, ended.error or "")
         else:
-            self._observer.checkpoint(ended.place, ended.moment.journal_offset)
-            self._saved, self._saved_at = ended.place, (ended.moment.env_steps, ended.moment.updates)
+            self._observer.checkpoint(ended.location, ended.moment.journal_offset)
+            self._saved, self._saved_at = ended.location, (ended.moment.env_steps, ended.moment.updates)
 
     def checkpoint(self) -> None:
         """Begins a checkpoint of the whole run at a moment when nothing is under way; none may be being written."""
@@ -274,7 +274,7 @@ class TrainingLoop:
         workers = {f"rollout worker {i}": worker for i, worker in enumerate(self._cluster.workers)}
         return {"the learner": self._cluster.learner, **workers}
 
-    def _save(self, folder: Place, journal_offset: int) -> dict[str, Any]:
+    def _save(self, folder: Location, journal_offset: int) -> dict[str, Any]:
         learner = self._calls.start(self._cluster.learner, "save", folder)
         workers = [
             self._calls.start(worker, "save", inside(folder, f"worker-{i}.safetensors"))

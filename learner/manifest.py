@@ -11,8 +11,8 @@ import json
 import re
 from typing import Any, NamedTuple
 
+from actors.locations import is_plain
 from actors.parts import FileSum
-from actors.places import is_plain
 from sim_core.checks import ConfigError
 
 VERSION = 3

@@ -12,9 +12,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from actors.calls import Calls, Node, Ref
+from actors.locations import Location, fetched, inside
 from actors.nodes import ShardNode
 from actors.parts import PartWriter, Written, join_written
-from actors.places import Place, fetched, inside
 from actors.transitions import AddReply, SampleReply, TransitionBlock
 from learner.learner import Learner, LearnerSettings, UpdateStats
 
@@ -93,7 +93,7 @@ class LearnerNode:
         refs = [self._shard_calls.start(shard, method) for shard in self._shards]
         return [self._shard_calls.get(ref) for ref in refs]
 
-    def save(self, folder: Place) -> dict[str, Any]:
+    def save(self, folder: Location) -> dict[str, Any]:
         """Starts to write learner and shards, as they are now, into `folder`; `saved` tells of its end.
 
         Returns:
@@ -113,18 +113,18 @@ class LearnerNode:
         own = self._writer.result()
         return None if own is None else join_written([own, *self._ask_all("saved")])
 
-    def load(self, folder: Place, state: dict[str, Any]) -> list[Ref]:
+    def load(self, folder: Location, state: dict[str, Any]) -> list[Ref]:
         """Takes up what `save` wrote and returned; publishes the weights (see `publish`).
 
         Raises:
           ValueError: the files are damaged or do not fit this run.
         """
-        place = inside(folder, WEIGHTS)
+        location = inside(folder, WEIGHTS)
         try:
-            with fetched(place) as path:
+            with fetched(location) as path:
                 self._learner.set_state(load_file(str(path)))
         except (SafetensorError, OSError, KeyError) as error:
-            raise ValueError(f"{place} cannot be read ({error})") from error
+            raise ValueError(f"{location} cannot be read ({error})") from error
         if len(state["shards"]) != len(self._shards):
             raise ValueError(f"the checkpoint has {len(state['shards'])} shards, this run {len(self._shards)}")
         refs = [

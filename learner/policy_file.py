@@ -8,8 +8,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from actors.locations import fetched, inside
 from actors.network import QNetwork, WeightsSnapshot, load_snapshot, snapshot
-from actors.places import fetched, inside
 from actors.vector_env import EnvShape
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig

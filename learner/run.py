@@ -7,8 +7,8 @@ from collections.abc import Callable
 from contextlib import closing
 from typing import NamedTuple, Protocol
 
+from actors.locations import Location
 from actors.network import WeightsSnapshot
-from actors.places import Place
 from actors.transitions import EpisodeStats
 from learner.addresses import hide_secrets
 from learner.checkpoint import Checkpoint, newest_valid
@@ -43,12 +43,12 @@ class Display(Protocol):
 class RunResult(NamedTuple):
     """How a run ended; `evaluation`, its `episodes` and `weights` are None if a signal stopped it before its end.
 
-    `checkpoint` is the place of the checkpoint of its end, None if that could not be written.
+    `checkpoint` is the location of the checkpoint of its end, None if that could not be written.
     """
 
     env_steps: int
     updates: int
-    checkpoint: Place | None
+    checkpoint: Location | None
     stopped_by: int | None
     evaluation: Evaluation | None
     episodes: EpisodeStats | None
@@ -79,7 +79,7 @@ class MirroringObserver:
         """Says so; the next checkpoint is tried as usual."""
         self._display.message(f"the checkpoint of {env_steps:,} env steps could not be written: {reason}")
 
-    def checkpoint(self, folder: Place, journal_offset: int) -> None:
+    def checkpoint(self, folder: Location, journal_offset: int) -> None:
         """Pushes the rows that the checkpoint covers; what fails is pushed with the next checkpoint."""
         try:
             self._tracker.push(self._journal.rows(self._pushed.read(), journal_offset))
@@ -108,7 +108,7 @@ def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list
       UselessCheckpointError: there is none, or all are damaged or too old.
       CheckpointError: it cannot be reached, is of a newer version, or belongs to another config.
     """
-    checkpoint, skipped = newest_valid(folder.checkpoint_place())
+    checkpoint, skipped = newest_valid(folder.checkpoint_location())
     check_state(checkpoint)
     check_config(checkpoint, config, folder.path / "config.json")
     return checkpoint, skipped
@@ -178,7 +178,7 @@ def _train(
     observer = MirroringObserver(tracker, journal, PushedMark(folder.pushed, journal.sync()), display)
     with stop_on_signals() as stop:
         storage = folder.storage()
-        loop = TrainingLoop(config, cluster, journal, folder.checkpoint_place(), observer, stop, storage.keep_best)
+        loop = TrainingLoop(config, cluster, journal, folder.checkpoint_location(), observer, stop, storage.keep_best)
         if checkpoint is not None:
             _restore(loop, checkpoint)
         finished = loop.run()

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from actors.places import Place, as_place
+from actors.locations import Location, as_location
 from learner.config import RunConfig, from_dict, to_dict
 from sim_core.checks import ConfigError, require
 
@@ -78,10 +78,10 @@ class RunFolder:
         require(type(best) is int and best >= 0, f"{path}: keep_best must be a whole number from 0 on, not {best!r}")
         return storage
 
-    def checkpoint_place(self) -> Place:
+    def checkpoint_location(self) -> Location:
         """Where the run's checkpoints lie (see `storage` for errors)."""
         url = self.storage().checkpoint_url
-        return self.checkpoints if url is None else as_place(url)
+        return self.checkpoints if url is None else as_location(url)
 
     def save_identity(self, identity: RunIdentity) -> None:
         """Writes `run.json`."""

@@ -15,9 +15,9 @@ NUM_ENVS, STEPS = 2, 8
 BLOCK = NUM_ENVS * STEPS
 
 
-def saved(node, place):
+def saved(node, location):
     """Has a node save itself and waits for the end; its state."""
-    state, deadline_s = node.save(place), time.monotonic() + 60
+    state, deadline_s = node.save(location), time.monotonic() + 60
     while (written := node.saved()) is None:
         assert time.monotonic() < deadline_s
         time.sleep(0.005)

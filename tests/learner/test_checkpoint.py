@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from actors.locations import inside
 from actors.parts import PartWriter, file_sum, join_written
-from actors.places import inside
 from learner.checkpoint import (
     Keep,
     best_valid,
@@ -51,13 +51,13 @@ def write(root, env_steps, seed=0):
     return complete_checkpoint(store, draft, env_steps, {**STATE, "seed": seed}, save_parts(draft, seed))
 
 
-def read(place):
-    return read_checkpoint(open_store(place.parent), place.name)
+def read(location):
+    return read_checkpoint(open_store(location.parent), location.name)
 
 
 def keep(root, newest, best=0, scores=()):
     store = open_store(root)
-    keep_checkpoints(store, store.place(store.names()[0]), Keep(newest, best, list(scores)))
+    keep_checkpoints(store, store.location(store.names()[0]), Keep(newest, best, list(scores)))
 
 
 def files_of(folder):
@@ -280,12 +280,12 @@ def test_a_state_that_is_no_object_is_refused(tmp_path, content):
     store = open_store(tmp_path)
     draft = store.draft(5)
     files = save_parts(draft)
-    place = complete_checkpoint(store, draft, 5, {}, files)
-    (place / "state.json").write_bytes(content)
-    manifest = encode_manifest(5, {**files, "state.json": file_sum(place / "state.json")})
-    (place / "manifest.json").write_bytes(manifest)
+    location = complete_checkpoint(store, draft, 5, {}, files)
+    (location / "state.json").write_bytes(content)
+    manifest = encode_manifest(5, {**files, "state.json": file_sum(location / "state.json")})
+    (location / "manifest.json").write_bytes(manifest)
     with pytest.raises(CheckpointError, match="state.json is no JSON object"):
-        read(place)
+        read(location)
 
 
 def test_a_missing_folder_is_refused(tmp_path):

@@ -8,8 +8,8 @@ import fsspec
 import pytest
 
 from actors.calls import LocalCalls
+from actors.locations import as_location, check_writable, fetched, inside
 from actors.parts import PartWriter
-from actors.places import as_place, check_writable, fetched, inside
 from learner.checkpoint import Keep, newest_valid
 from learner.checkpointer import Checkpointer, Moment
 from learner.manifest import CheckpointError, UselessCheckpointError
@@ -42,7 +42,7 @@ class Part:
 
 
 class Run:
-    """A run that checkpoints to a place."""
+    """A run that checkpoints to a location."""
 
     def __init__(self, root):
         self.root = root
@@ -63,7 +63,7 @@ class Run:
         return self.checkpointer.wait()
 
     def files(self):
-        """All that lies at the place, by relative name."""
+        """All that lies at the location, by relative name."""
         files, path = fsspec.core.url_to_fs(str(self.root), use_listings_cache=False)
         return sorted(name.removeprefix(path).strip("/") for name in files.find(path))
 
@@ -78,17 +78,17 @@ class Run:
 @pytest.fixture(params=["folder", "memory", "s3"])
 def run(request, tmp_path):
     if request.param == "folder":
-        return Run(as_place(f"file://{tmp_path}/checkpoints"))
+        return Run(as_location(f"file://{tmp_path}/checkpoints"))
     if request.param == "memory":
-        return Run(as_place(f"memory://{uuid.uuid4()}/checkpoints/"))
-    return Run(as_place(f"{request.getfixturevalue('s3_server')}/{uuid.uuid4()}"))
+        return Run(as_location(f"memory://{uuid.uuid4()}/checkpoints/"))
+    return Run(as_location(f"{request.getfixturevalue('s3_server')}/{uuid.uuid4()}"))
 
 
 def test_what_was_written_is_read_back(run):
     ended = run.write(100, 5)
     assert ended.error is None and ended.moment == Moment(100, 5, 700)
     found, skipped = newest_valid(run.root)
-    assert found.folder == ended.place and not skipped
+    assert found.folder == ended.location and not skipped
     assert found.state == {"env_steps": 100, "updates": 5}
     for name in run.nodes:
         with fetched(inside(found.folder, name)) as path:
@@ -121,7 +121,7 @@ def test_a_full_disk_is_told_once_and_the_older_checkpoint_stays(run):
     before = run.files()
     run.nodes["learner"].fails = True
     ended = run.write(200)
-    assert ended.place is None and "No space left on device" in ended.error
+    assert ended.location is None and "No space left on device" in ended.error
     assert run.checkpointer.poll() is None and run.files() == before
     assert newest_valid(run.root)[0].state["env_steps"] == 100
     run.nodes["learner"].fails = False
@@ -136,7 +136,7 @@ def test_a_part_that_never_ends_does_not_hold_up_the_run(run, monkeypatch):
     assert "worker did not write within" in run.write(100).error
     run.begin(200)
     assert "still being written" in stuck.saved().error
-    assert run.checkpointer.wait().place is None
+    assert run.checkpointer.wait().location is None
     stuck.go.set()
     for node in run.nodes.values():
         node._writer._thread.join(60)
@@ -212,7 +212,7 @@ def test_a_bucket_that_is_gone_for_a_while_costs_the_checkpoints_of_that_while(s
     assert run.write(100, newest=1).error is None
     files.rm(bucket, recursive=True)
     ended = run.write(200)
-    assert ended.place is None and "bucket" in ended.error.lower()
+    assert ended.location is None and "bucket" in ended.error.lower()
     files.mkdir(bucket)
     assert run.write(300).error is None
     assert newest_valid(run.root)[0].state["env_steps"] == 300
@@ -224,7 +224,7 @@ def test_urls_that_cannot_work_are_refused_with_a_sentence(s3_server):
     with pytest.raises(ConfigError, match="nosuchprotocol://x cannot be opened"):
         check_writable("nosuchprotocol://x")
     with pytest.raises(ConfigError, match="must not hold a user or password"):
-        as_place("s3://key:secret@bucket/x")
+        as_location("s3://key:secret@bucket/x")
     check_writable(f"{s3_server}/fine")
     with pytest.raises(CheckpointError, match="cannot be listed"):
         newest_valid("s3://no-such-bucket-here/x")

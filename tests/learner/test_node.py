@@ -22,9 +22,9 @@ def make_block(rows, sequence=0, worker_id=0, incarnation=0, version=0, schema=S
     return TransitionBlock(header, rows, join_stats([]))
 
 
-def saved(node, place):
+def saved(node, location):
     """Has a node save itself and waits for the end; its state."""
-    state, deadline_s = node.save(place), time.monotonic() + 60
+    state, deadline_s = node.save(location), time.monotonic() + 60
     while (written := node.saved()) is None:
         assert time.monotonic() < deadline_s
         time.sleep(0.005)

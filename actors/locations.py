@@ -15,12 +15,12 @@ from fsspec.core import url_to_fs
 
 from sim_core.checks import ConfigError
 
-Place = Path | str
+Location = Path | str
 """A local path, or a URL as text."""
 
 
-def as_place(text: str) -> Place:
-    """The place that a user names; `file://` and plain paths are local.
+def as_location(text: str) -> Location:
+    """The location that a user names; `file://` and plain paths are local.
 
     Raises:
       ConfigError: the URL holds a password.
@@ -37,9 +37,9 @@ def as_place(text: str) -> Place:
     return text.rstrip("/")
 
 
-def inside(place: Place, name: str) -> Place:
-    """The file or folder `name` of a place."""
-    return place / name if isinstance(place, Path) else f"{place}/{name}"
+def inside(location: Location, name: str) -> Location:
+    """The file or folder `name` of a location."""
+    return location / name if isinstance(location, Path) else f"{location}/{name}"
 
 
 def is_plain(name: str) -> bool:
@@ -50,15 +50,15 @@ def is_plain(name: str) -> bool:
 
 
 @contextmanager
-def storage_errors(place: Place) -> Iterator[None]:
-    """Turns what a storage's client raises (each its own) into OSError that names the place."""
+def storage_errors(location: Location) -> Iterator[None]:
+    """Turns what a storage's client raises (each its own) into OSError that names the location."""
     try:
         yield
     except (OSError, ConfigError):
         raise
     except Exception as error:
         first_line = (str(error).splitlines() or [""])[0]
-        raise OSError(f"{place}: {type(error).__name__} {first_line}") from error
+        raise OSError(f"{location}: {type(error).__name__} {first_line}") from error
 
 
 def filesystem(url: str) -> tuple[Any, str]:
@@ -95,47 +95,47 @@ def check_writable(url: str) -> None:
 
 
 @contextmanager
-def staged(place: Place) -> Iterator[Path]:
-    """A local path to write a file or folder to, which is at `place` once the `with` block has ended."""
-    if isinstance(place, Path):
-        place.parent.mkdir(parents=True, exist_ok=True)
-        yield place
+def staged(location: Location) -> Iterator[Path]:
+    """A local path to write a file or folder to, which is at `location` once the `with` block has ended."""
+    if isinstance(location, Path):
+        location.parent.mkdir(parents=True, exist_ok=True)
+        yield location
         return
     with tempfile.TemporaryDirectory(prefix="shoal-") as folder:
-        local = Path(folder) / place.rsplit("/", 1)[1]
+        local = Path(folder) / location.rsplit("/", 1)[1]
         yield local
-        with storage_errors(place):
-            files, path = filesystem(place)
+        with storage_errors(location):
+            files, path = filesystem(location)
             made = files_under(local)
             target = path.rsplit("/", 1)[0]
             files.put([str(file) for file in made.values()], [f"{target}/{name}" for name in made])
 
 
 @contextmanager
-def fetched(place: Place) -> Iterator[Path]:
-    """A local path to read the file or folder at `place` from, within the `with` block.
+def fetched(location: Location) -> Iterator[Path]:
+    """A local path to read the file or folder at `location` from, within the `with` block.
 
     Raises:
       OSError: nothing is there, or a name there would lead elsewhere.
     """
-    if isinstance(place, Path):
-        yield place
+    if isinstance(location, Path):
+        yield location
         return
     with tempfile.TemporaryDirectory(prefix="shoal-") as folder:
-        with storage_errors(place):
-            files, path = filesystem(place)
+        with storage_errors(location):
+            files, path = filesystem(location)
             found = files.find(path)
             if not found:
-                raise FileNotFoundError(f"there is nothing at {place}")
+                raise FileNotFoundError(f"there is nothing at {location}")
             parent = path.rsplit("/", 1)[0] + "/"
             names = [file.removeprefix(parent) for file in found]
             if not all(is_plain(name) for name in names):
-                raise OSError(f"{place} holds names that lead out of its folder")
+                raise OSError(f"{location} holds names that lead out of its folder")
             local = [Path(folder) / name for name in names]
             for target in local:
                 target.parent.mkdir(parents=True, exist_ok=True)
             files.get(found, [str(target) for target in local])
-        yield Path(folder) / place.rsplit("/", 1)[1]
+        yield Path(folder) / location.rsplit("/", 1)[1]
 
 
 def files_under(path: Path) -> dict[str, Path]:
