@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: train test bench bench-exactness lint setup clean
+.PHONY: train test bench bench-exactness fuzz lint setup clean
 
 setup: $(READY)
 
@@ -35,6 +35,10 @@ bench: $(READY)
 # How exact the simulator is: RVO2, float64, FL-ORCA's episodes. ARGS="--episodes 20 --scenes 800" for a short one.
 bench-exactness: $(READY)
 	$(BIN)/python -m tests.benchmarks.exactness $(ARGS)
+
+# Over ten thousand random command lines and config files. ARGS="--share 0.1" for some, ARGS="--seed 1" for others.
+fuzz: $(READY)
+	$(BIN)/python -m tests.benchmarks.fuzz $(ARGS)
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -13,7 +13,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from actors.storage import load_rows, save_rows
+from actors.storage import load_rows, open_store, save_rows
 from actors.transitions import EpisodeStats
 from actors.vector_env import EnvSpec
 from sim_core.checks import ConfigError, require
@@ -75,7 +75,7 @@ def load_evaluation(path: Path) -> StoredEvaluation:
       ValueError: the group is missing, damaged, or something else.
     """
     rows = load_rows(path, EPISODE, FORMAT)
-    attributes: Any = zarr.open_group(str(path), mode="r").attrs.asdict()
+    attributes: Any = open_store(path).attrs.asdict()
     header = attributes.get("header")
     if header is None or _crc32(header) != attributes.get("header_crc32"):
         raise ValueError(f"the header of {path} is damaged (checksum); evaluate again")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +17,9 @@ from safetensors.numpy import load_file, save_file
 
 from actors.calls import Calls, Node, Ref
 from actors.faults import Action, CallFailed, Fault, PartKind, decide
+from actors.locations import Location, fetched
 from actors.network import WeightsSnapshot
+from actors.parts import PartWriter, Written
 from actors.prioritised import PrioritisedShard, PrioritySettings
 from actors.replay import ReplayShard
 from actors.rollout import RolloutSettings, RolloutWorker
@@ -50,6 +51,7 @@ class ShardNode:
 
     def __init__(self, settings: ShardSettings) -> None:
         self.shard = make_shard(settings)
+        self._writer = PartWriter()
         self._version = -1
         self._weights: Ref = None
         self._known: dict[int, deque[tuple[int, int]]] = {}
@@ -109,13 +111,25 @@ class ShardNode:
         """Transitions held."""
         return self.shard.size
 
-    def save(self, path: Path) -> dict[str, Any]:
-        """Saves the shard (see ReplayShard.save)."""
-        return self.shard.save(path)
+    def save(self, location: Location) -> dict[str, Any]:
+        """Starts to write what the shard holds now to a zarr group at `location`; `saved` tells of its end.
 
-    def load(self, path: Path, state: dict[str, Any]) -> None:
-        """Loads the shard (see ReplayShard.load)."""
-        self.shard.load(path, state)
+        Returns:
+          The state that belongs to it, for JSON.
+        """
+        snapshot = self.shard.snapshot()
+        if not self._writer.start(location, snapshot.save):
+            snapshot.close()
+        return self.shard.get_state()
+
+    def saved(self) -> Written | None:
+        """How the last `save` ended; None while it is being written."""
+        return self._writer.result()
+
+    def load(self, location: Location, state: dict[str, Any]) -> None:
+        """Takes up what `save` wrote and returned (see ReplayShard.load)."""
+        with fetched(location) as path:
+            self.shard.load(path, state)
 
 
 class _Push(NamedTuple):
@@ -172,6 +186,7 @@ class RolloutNode:
         self._shard_incarnations = [0] * len(shards)
         self._next_shard = worker_id % len(shards)
         self._limit = pushes_in_flight
+        self._writer = PartWriter()
         self._pushes: deque[_Push] = deque()
 
     def replace_shard(self, index: int, shard: Node, incarnation: int) -> None:
@@ -238,27 +253,35 @@ class RolloutNode:
         except CallFailed:
             return  # lost with the learner that made them; the next learner's come with the replies to come
 
-    def save(self, path: Path) -> dict[str, Any]:
-        """Writes the worker's arrays to `path`; returns the rest of its state, for JSON.
+    def save(self, location: Location) -> dict[str, Any]:
+        """Starts to write the worker's arrays as they are now to the file `location`; `saved` tells of its end.
+
+        Returns:
+          The rest of its state, for JSON.
 
         Raises:
           RuntimeError: pushes are under way.
         """
         if self._pushes:
             raise RuntimeError("settle before the state is saved: pushes are under way")
-        saved = self._worker.get_state()
-        save_file(saved["arrays"], str(path))
-        return {**saved["meta"], "next_shard": self._next_shard}
+        state = self._worker.get_state()
+        self._writer.start(location, lambda path: save_file(state["arrays"], str(path)))
+        return {**state["meta"], "next_shard": self._next_shard}
 
-    def load(self, path: Path, state: dict[str, Any]) -> None:
+    def saved(self) -> Written | None:
+        """How the last `save` ended; None while it is being written."""
+        return self._writer.result()
+
+    def load(self, location: Location, state: dict[str, Any]) -> None:
         """Takes up what `save` wrote and returned.
 
         Raises:
           ValueError: the file is damaged or does not fit.
         """
         try:
-            arrays = load_file(str(path))
+            with fetched(location) as path:
+                arrays = load_file(str(path))
         except (SafetensorError, OSError) as error:
-            raise ValueError(f"{path} cannot be read ({error})") from error
+            raise ValueError(f"{location} cannot be read ({error})") from error
         self._next_shard = state["next_shard"] % len(self._shards)
         self._worker.set_state(arrays, state)

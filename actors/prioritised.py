@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.replay import ReplayShard
+from actors.replay import ReplayShard, ShardSnapshot
+from actors.ring_snapshot import RingSnapshot
 from actors.storage import load_rows, save_rows
 from actors.sum_tree import SumTree
 from actors.transitions import Draws, SampleReply
@@ -33,6 +34,24 @@ class PrioritySettings(NamedTuple):
 
     exponent: float
     strata: int
+
+
+class PrioritisedSnapshot(ShardSnapshot):
+    """As ShardSnapshot; the priorities lie in a zarr group of their own within that of the rows.
+
+    Args:
+      rows: the shard's rows.
+      priorities: a copy of theirs `[size]`.
+    """
+
+    def __init__(self, rows: RingSnapshot, priorities: NDArray[np.float64]) -> None:
+        super().__init__(rows)
+        self._priorities = priorities
+
+    def save(self, path: Path) -> None:
+        """Writes rows and priorities to `path`, once."""
+        super().save(path)
+        save_rows(path / PRIORITIES, self._priorities.view(SAVED))
 
 
 class PrioritisedShard(ReplayShard):
@@ -114,11 +133,9 @@ class PrioritisedShard(ReplayShard):
         """As ReplayShard's, with what is behind the priorities of rows to come."""
         return {**super().get_state(), "largest_priority": self._largest, "stale": self._stale}
 
-    def save(self, path: Path) -> dict[str, Any]:
-        """As ReplayShard's; the priorities lie in a zarr group of their own within that of the rows."""
-        state = super().save(path)
-        save_rows(path / PRIORITIES, self.priorities.view(SAVED))
-        return state
+    def snapshot(self) -> PrioritisedSnapshot:
+        """As ReplayShard's; priorities are copied at once, for answers to come change them."""
+        return PrioritisedSnapshot(self._ring_snapshot(), self.priorities.copy())
 
     def load(self, path: Path, state: dict[str, Any]) -> None:
         """As ReplayShard's.
@@ -128,7 +145,7 @@ class PrioritisedShard(ReplayShard):
         """
         if "largest_priority" not in state:
             raise ValueError(f"{path} was saved without priorities (replay = uniform)")
-        priorities = load_rows(path / PRIORITIES, SAVED)["priority"]
+        priorities = load_rows(path / PRIORITIES, SAVED, at_most=len(self._rows))["priority"]
         if len(priorities) != state["size"]:
             raise ValueError(f"{path / PRIORITIES} holds {len(priorities)} priorities for {state['size']} transitions")
         super().load(path, state)

@@ -5,12 +5,14 @@ One plain class for both placements (in the learner's process, or as a Ray actor
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.ring_snapshot import RingSnapshot
 from actors.storage import load_rows, save_rows
 from actors.transitions import SCHEMA_VERSION, BlockHeader, SampleReply, TransitionBlock
 
@@ -20,6 +22,26 @@ class Stored(NamedTuple):
 
     rows: int
     duplicate: bool
+
+
+class ShardSnapshot:
+    """What a shard holds at one moment, for another thread to write while the shard is written on.
+
+    Args:
+      rows: its rows.
+    """
+
+    def __init__(self, rows: RingSnapshot) -> None:
+        self.rows = rows
+
+    def save(self, path: Path) -> None:
+        """Writes the rows to a zarr group at `path`, once."""
+        with closing(self.rows):
+            save_rows(path, self.rows)
+
+    def close(self) -> None:
+        """Frees what nobody will write."""
+        self.rows.close()
 
 
 class ReplayShard:
@@ -43,6 +65,7 @@ class ReplayShard:
         self._dropped = 0
         self._newest: dict[int, tuple[int, int]] = {}
         self._rng = np.random.Generator(np.random.PCG64(seed))
+        self._snapshot = RingSnapshot(self._rows, 0)
 
     @property
     def size(self) -> int:
@@ -98,6 +121,8 @@ class ReplayShard:
         rows = rows[-capacity:]
         packed = rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)  # not field by field: half the time
         first = min(len(rows), capacity - self._next)
+        self._snapshot.protect(self._next, self._next + first)
+        self._snapshot.protect(0, len(rows) - first)
         self._bytes[self._next : self._next + first] = packed[:first]
         self._bytes[: len(rows) - first] = packed[first:]
         self._next = (self._next + len(rows)) % capacity
@@ -122,7 +147,7 @@ class ReplayShard:
         return taken.view(self._rows.dtype).reshape(len(slots))
 
     def get_state(self) -> dict[str, Any]:
-        """Counters and random stream, for JSON; the rows are saved by `save`."""
+        """Counters and random stream, for JSON; the rows are in `snapshot`."""
         return {
             "next": self._next,
             "size": self._size,
@@ -132,22 +157,25 @@ class ReplayShard:
             "rng": self._rng.bit_generator.state,
         }
 
-    def save(self, path: Path) -> dict[str, Any]:
-        """Writes the rows to a zarr group at `path` and returns the state that belongs to them."""
-        save_rows(path, self._rows[: self._size])
-        return self.get_state()
+    def snapshot(self) -> ShardSnapshot:
+        """What the shard holds now; one taken before may not be written any more."""
+        return ShardSnapshot(self._ring_snapshot())
+
+    def _ring_snapshot(self) -> RingSnapshot:
+        self._snapshot = RingSnapshot(self._rows, self._size)
+        return self._snapshot
 
     def load(self, path: Path, state: dict[str, Any]) -> None:
-        """Takes up what `save` wrote and returned.
+        """Takes up the rows of a `snapshot` that were saved at `path`, and the `get_state` of the same moment.
 
         Raises:
           ValueError: the saved rows do not fit this shard.
         """
-        rows = load_rows(path, self._rows.dtype)
+        rows = load_rows(path, self._rows.dtype, at_most=len(self._rows))
         if len(rows) != state["size"]:
             raise ValueError(f"{path} holds {len(rows)} transitions, not the {state['size']} of its checkpoint")
         capacity = len(self._rows)
-        if len(rows) > capacity or (len(rows) < capacity and state["next"] != len(rows)):
+        if state["next"] != (len(rows) if len(rows) < capacity else state["next"] % capacity):
             raise ValueError(f"{path} is the ring of a shard with another capacity than {capacity}")
         self._rows[: len(rows)] = rows
         self._next, self._size = state["next"], state["size"]

@@ -14,6 +14,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from actors.storage import open_store
 from sim_core.config import WorldConfig
 
 FORMAT = "shoal-trajectories-1"
@@ -53,7 +54,7 @@ def save_episodes(path: Path, episodes: list[Episode], config: WorldConfig) -> N
         raise ValueError("no episodes to save")
     part = path.with_name(path.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
-    root = zarr.open_group(str(part), mode="w")
+    root = zarr.open_group(str(part), mode="w", zarr_format=3)
     root.attrs.update({"format": FORMAT, "config": dataclasses.asdict(config)})
     for key in TIME_KEYS:
         root.create_array(f"data/{key}", data=np.concatenate([getattr(episode, key) for episode in episodes]))
@@ -73,8 +74,8 @@ def load_episodes(path: Path) -> tuple[list[Episode], WorldConfig]:
       ValueError: `path` holds something else.
     """
     try:
-        root = zarr.open_group(str(path), mode="r")
-    except (FileNotFoundError, zarr.errors.GroupNotFoundError) as error:
+        root = open_store(path)
+    except ValueError as error:
         raise ValueError(
             f"{path} holds no recorded episodes; name a folder that `shoal watch` or `shoal evaluate --record` wrote"
         ) from error

@@ -16,7 +16,7 @@ from deploy.chaos_config import CONFIG, NAME, write_config
 from deploy.chaos_processes import Driver, TrackingServer
 from deploy.folders import make_folder
 from deploy.options import Chaos
-from learner.checkpoint import finished_folders
+from learner.checkpoint import finished_names
 from learner.fault_log import DRIVER, FaultEntry, read_faults
 from learner.journal import PushedMark
 from learner.run_folder import RunFolder
@@ -111,7 +111,7 @@ class _ChaosRun:
         return code
 
     def _checkpoints(self) -> set[str]:
-        return {path.name for path in finished_folders(self.folder.checkpoints)}
+        return set(finished_names(self.folder.checkpoint_location()))
 
     def _may_hurt(self) -> bool:
         """Not before the first checkpoint, nor before the next one after a setback, so that the run gets on."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 import sys
 import tomllib
@@ -41,6 +42,8 @@ BAD_INPUT = 2
 INTERRUPTED = 130
 JOBS = ("train", "sweep")
 """What `shoal submit` runs."""
+BAD_NAMES = (errno.ENAMETOOLONG, errno.EILSEQ, errno.ELOOP)
+"""Errors of paths that no file can have, wherever a command first looks at them."""
 
 
 def read_config_file(path: Path) -> RunConfig:
@@ -176,7 +179,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return execute(parse(sys.argv[1:] if arguments is None else arguments))
     except ConfigError as error:
-        print(f"shoal: {error}", file=sys.stderr)
+        print(f"shoal: {' '.join(str(error).splitlines())}", file=sys.stderr)  # names may hold line breaks
+        return BAD_INPUT
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except OSError as error:
+        if error.errno not in BAD_NAMES:
+            raise
+        name = str(error.filename)
+        short = name if len(name) <= 60 else f"{name[:60]}..."
+        print(f"shoal: {short!r} cannot name a file ({error.strerror}); choose another name", file=sys.stderr)
         return BAD_INPUT
     except RunFailed as error:
         print(f"shoal: {error}", file=sys.stderr)
@@ -184,6 +197,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("shoal: interrupted", file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED

@@ -13,11 +13,13 @@ from actors.network import QNetwork, WeightsSnapshot, load_snapshot
 from actors.vector_env import env_shape
 from deploy.folders import make_folder
 from deploy.options import Export
-from deploy.policies import newest_policy
-from learner.checkpoint import MANIFEST, read_checkpoint
+from deploy.policies import find_policy
+from learner.checkpoint import read_checkpoint
+from learner.checkpoint_store import FolderStore
 from learner.config import RunConfig, config_hash, to_dict
 from learner.export import Agreement, check_packages, write_export
 from learner.export_ports import FRAME, Port, bare_inputs, bare_outputs, robot_inputs, robot_outputs
+from learner.manifest import MANIFEST
 from learner.onboard import BarePolicy, make_robot
 from learner.policy_file import read_policy, read_saved_policy
 from learner.run_folder import RunFolder, find_run
@@ -50,10 +52,11 @@ def find_source(name: str, runs_dir: Path) -> Source:
     if (path / MANIFEST).is_file():
         folder = find_run(str(path.absolute().parent.parent), runs_dir)
         config = folder.config()
-        return Source(folder, config, read_policy(read_checkpoint(path), config, env_shape(config.env)))
+        checkpoint = read_checkpoint(FolderStore(path.absolute().parent), path.absolute().name)
+        return Source(folder, config, read_policy(checkpoint, config, env_shape(config.env)))
     folder = find_run(name, runs_dir)
     config = folder.config()
-    return Source(folder, config, newest_policy(folder, config))
+    return Source(folder, config, find_policy(folder, config))
 
 
 class _Parts(NamedTuple):

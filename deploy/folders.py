@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from actors.locations import as_location, check_writable, inside
+from learner.checkpoint_store import open_store
+from learner.run_folder import Storage
 from sim_core.checks import ConfigError, require
 
 JOB = "RAY_JOB_CONFIG_JSON_ENV_VAR"
@@ -30,6 +33,30 @@ def make_folder(path: Path, flag: str) -> None:
     except OSError as error:
         raise ConfigError(f"{flag} {path} cannot be made ({error}); name a folder that you may write to") from error
     require(os.access(path, os.W_OK), f"{flag} {path} cannot be written to; name a folder that you may write to")
+
+
+def new_storage(checkpoint_url: str | None, name: str, keep_best: int) -> Storage:
+    """How a new run `name` stores its checkpoints: under `--checkpoint-url`, in a folder of its own there.
+
+    Raises:
+      ConfigError: nothing can be written there, or a run of that name has checkpoints there.
+    """
+    if checkpoint_url is None:
+        return Storage(None, keep_best)
+    root = as_location(checkpoint_url)
+    if isinstance(root, Path):
+        make_folder(root, "--checkpoint-url")
+    else:
+        check_writable(root)
+    location = inside(root, name)
+    try:
+        taken = open_store(location).names()
+    except OSError as error:
+        raise ConfigError(f"--checkpoint-url {location} cannot be listed ({error}); name another one") from error
+    require(
+        not taken, f"--checkpoint-url {location} holds the checkpoints of another run; choose another --name or URL"
+    )
+    return Storage(str(location), keep_best)
 
 
 def check_plain_name(name: str) -> None:

@@ -90,6 +90,13 @@ class Train:
     """What to learn."""
     launch: Launch = field(default_factory=Launch)
     """Where."""
+    checkpoint_url: str | None = None
+    """Folder or fsspec URL (s3://bucket/path) for the run's checkpoints; its own folder by default."""
+    keep_best: int = 1
+    """Checkpoints that did best in the evaluations during training, kept beside the newest (--keep-checkpoints)."""
+
+    def __post_init__(self) -> None:
+        require(self.keep_best >= 0, f"--keep-best must be at least 0, not {self.keep_best}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,6 +158,8 @@ class Evaluate:
     """Robots per group; by default those of the training (others: Extrapolation), or 10 for a baseline."""
     groups: int | None = None
     """Groups; by default those of the training (others: Extrapolation), or 2 for a baseline."""
+    checkpoint: Literal["newest", "best"] = "newest"
+    """The newest checkpoint's policy, or the one that did best in the evaluations during training."""
     out: Path | None = None
     """New file (.zarr) for the results: seed, outcome, length and return of every episode."""
     record: int = 0
@@ -161,7 +170,7 @@ class Evaluate:
     """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
 
     def __post_init__(self) -> None:
-        require(self.episodes >= 1, f"--episodes must be at least 1, not {self.episodes}")
+        require(1 <= self.episodes <= 10**7, f"--episodes must be in 1..{10**7}, not {self.episodes}")
         require(
             0 <= self.first_seed <= 2**32 - 1 - self.episodes,
             f"--first-seed must be in 0..{2**32 - 1 - self.episodes}, not {self.first_seed}",
@@ -193,6 +202,8 @@ class Watch:
     """Look into a running training: a page on 127.0.0.1 that plays the newest checkpoint's policy, again and again."""
     port: int = 8400
     """--live: port of the page; 0 takes a free one."""
+    checkpoint: Literal["newest", "best"] = "newest"
+    """The newest checkpoint's policy, or the one that did best in the evaluations during training."""
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
 

@@ -20,7 +20,7 @@ from deploy.artifacts import foreign_animation, write_player, write_video
 from deploy.folders import make_folder
 from deploy.live import watch_live
 from deploy.options import Evaluate, Watch, ray_address
-from deploy.policies import newest_policy
+from deploy.policies import find_policy
 from deploy.tables import evaluation_table
 from learner.config import RunConfig
 from learner.presets import preset_config
@@ -83,7 +83,7 @@ def _run_entry(command: Evaluate) -> Entry:
         f"--robots and --groups apply to our own environment, not to {config.env_id}",
     )
     config = dataclasses.replace(config, world=_on_setup(config.world, command))
-    weights = newest_policy(folder, config)
+    weights = find_policy(folder, config, command.checkpoint)
     title = f"{config.world.method} {config.world.setup}" if config.env.is_swarm else config.env_id
     return Entry(config.env, weights, folder.path.name, weights.version, title)
 
@@ -122,7 +122,7 @@ def watch(command: Watch) -> int:
     config = folder.config()
     if command.live:
         return watch_live(folder, config, command)
-    weights = newest_policy(folder, config)
+    weights = find_policy(folder, config, command.checkpoint)
     path = command.out or folder.artifacts / f"episode-{command.seed}.{command.format}"
     path.parent.mkdir(parents=True, exist_ok=True)
     if config.env.is_swarm:

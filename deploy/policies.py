@@ -2,34 +2,41 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from rich.console import Console
 
 from actors.network import WeightsSnapshot
 from actors.vector_env import env_shape
-from learner.checkpoint import finished_folders, newest_valid
+from learner.checkpoint import best_valid, finished_names, newest_valid
 from learner.config import RunConfig
+from learner.journal import read_rows
 from learner.policy_file import read_policy, read_saved_policy
+from learner.retention import scores_of
 from learner.run_folder import RunFolder
 from sim_core.checks import ConfigError
 
 
-def newest_policy(folder: RunFolder, config: RunConfig) -> WeightsSnapshot:
-    """The policy of a sweep's finished cell, or that of the newest usable checkpoint.
+def find_policy(folder: RunFolder, config: RunConfig, which: Literal["newest", "best"] = "newest") -> WeightsSnapshot:
+    """The policy of a sweep's finished cell, or that of a usable checkpoint.
 
     Args:
       folder: the run.
       config: its config, or one of another setup that the policy fits.
+      which: the newest checkpoint, or the one that did best in the evaluations during training.
 
     Raises:
       CheckpointError: there is none, or it does not fit.
     """
     shape = env_shape(config.env)
-    is_swept = folder.results.is_file() or not folder.checkpoints.exists()
+    is_swept = folder.results.is_file() or not (folder.checkpoints.exists() or folder.storage().checkpoint_url)
     if folder.policy.is_file() and is_swept:  # of a cell that is done, only the policy is kept
         return read_saved_policy(folder.policy, config, shape)
-    checkpoint, skipped = newest_valid(folder.checkpoints)
+    root = folder.checkpoint_location()
+    scores = scores_of(read_rows(folder.journal)) if which == "best" else None
+    checkpoint, skipped = newest_valid(root) if scores is None else best_valid(root, scores)
     for reason in skipped:
-        Console(stderr=True).print(f"skipped: {reason}", highlight=False)
+        Console(stderr=True).print(f"skipped: {reason}", markup=False, highlight=False, soft_wrap=True)
     return read_policy(checkpoint, config, shape)
 
 
@@ -53,18 +60,18 @@ class NewestPolicy:
         Raises:
           ConfigError: the run has none yet.
         """
-        signature = policy_signature(self._folder)
-        if signature != self._seen:
-            try:
-                self._weights, self._seen = newest_policy(self._folder, self._config), signature
-            except ConfigError:
-                if self._weights is None:
-                    raise  # else a checkpoint was being removed: the next call looks again
+        try:
+            signature = policy_signature(self._folder)
+            if signature != self._seen:
+                self._weights, self._seen = find_policy(self._folder, self._config), signature
+        except ConfigError:
+            if self._weights is None:
+                raise  # else a checkpoint was being removed, or the storage is away: the next call looks again
         assert self._weights is not None
         return self._weights
 
 
 def policy_signature(folder: RunFolder) -> tuple[str, ...]:
     """Changes when a run has another newest policy."""
-    names = [path.name for path in finished_folders(folder.checkpoints)[:1]]
+    names = finished_names(folder.checkpoint_location())[:1]
     return (*names, str(folder.policy.stat().st_mtime_ns)) if folder.policy.is_file() else tuple(names)

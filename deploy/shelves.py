@@ -16,7 +16,7 @@ from dashboards.player import player_data
 from dashboards.pooled import METHOD_NAMES, Setup
 from dashboards.web_assets import to_json
 from dashboards.web_report import EpisodeGroup
-from deploy.policies import NewestPolicy, newest_policy
+from deploy.policies import NewestPolicy, find_policy
 from learner.run_folder import RunFolder
 from learner.trial import EVALUATIONS
 from sim_core.checks import ConfigError
@@ -98,7 +98,7 @@ def _order(row: ResultRow) -> tuple[object, ...]:
 def _candidate(place: _Place) -> Candidate:
     if place.row.policy != LEARNED:
         return Baseline(place.row.policy)
-    return newest_policy(place.folder, place.folder.config())
+    return find_policy(place.folder, place.folder.config())
 
 
 def _group(key: str, row: ResultRow) -> EpisodeGroup:

@@ -7,7 +7,6 @@ import shlex
 from rich.table import Table
 
 from actors.estimates import Estimate
-from learner.checkpoint import newest_valid
 from learner.results import Evaluation, outcome_label
 from learner.run import RunResult
 from learner.run_folder import RunFolder
@@ -37,10 +36,9 @@ def _plain(estimate: Estimate, digits: int) -> tuple[str, str]:
 
 def summary_lines(folder: RunFolder, result: RunResult, tracking_uri: str, is_swarm: bool) -> list[str]:
     """What a finished run left behind, and how to look at it; lines, so that paths can be copied whole."""
-    checkpoint, _ = newest_valid(folder.checkpoints)
     lines = {
         "trained": f"{result.env_steps:,} env steps, {result.updates:,} updates",
-        "checkpoint": str(checkpoint.folder),
+        "checkpoint": str(result.checkpoint or "of its end: could not be written"),
         "curve": str(folder.artifacts / "learning_curve.png"),
         "animation": str(folder.artifacts / ("episode.html" if is_swarm else "episode.mp4")),
         "MLflow UI": tracking_uri,

@@ -12,12 +12,14 @@ from rich.console import Console
 from actors.baselines import Baseline
 from actors.vector_env import env_shape
 from deploy.artifacts import log_artifacts
-from deploy.folders import check_lasting, check_plain_name, make_folder
+from deploy.folders import check_lasting, check_plain_name, make_folder, new_storage
 from deploy.options import Launch, Resume, Train
 from deploy.progress import make_display
 from deploy.tables import evaluation_table, summary_lines
-from learner.checkpoint import Checkpoint, finished_folders
+from learner.addresses import full_uri, public_uri
+from learner.checkpoint import Checkpoint, finished_names
 from learner.config import RunConfig, config_hash
+from learner.footprint import check_fits
 from learner.journal import Row
 from learner.learner import learning_device
 from learner.place import Place
@@ -56,13 +58,18 @@ def train(command: Train) -> int:
         with folder.hold():
             return _go_on(folder, config, launch.place())
     make_folder(launch.runs_dir, "--runs-dir")
-    env_shape(config.env)  # refuses an environment that cannot be made
-    _check_device(config, launch.place().address)
+    if launch.ray_address() is None:
+        check_fits(config)
+    else:
+        env_shape(config.env)  # refuses an environment that cannot be made
+    _check_device(config, launch.ray_address())
+    storage = new_storage(command.checkpoint_url, folder.path.name, command.keep_best)
     tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
     tracker.start(config)
     with folder.hold():
+        folder.save_storage(storage)
         folder.save_config(config)
-        folder.save_identity(RunIdentity(config.name, tracker.uri, launch.experiment, tracker.run_id))
+        folder.save_identity(RunIdentity(config.name, public_uri(tracker.uri), launch.experiment, tracker.run_id))
         return _run(folder, config, tracker, None, launch.place())
 
 
@@ -92,20 +99,20 @@ def _go_on(folder: RunFolder, config: RunConfig, place: Place) -> int:
         Console().print(f"run {folder.path} has finished before", highlight=False, soft_wrap=True)
         return 0
     checkpoint = None
-    if finished_folders(folder.checkpoints):
+    if finished_names(folder.checkpoint_location()):
         checkpoint, skipped = resume_point(folder, config)
         _say_where(checkpoint, skipped)
     return _resumed(folder, config, tracker, checkpoint, place)
 
 
 def _tracker(identity: RunIdentity) -> Tracker:
-    return Tracker(identity.tracking_uri, identity.experiment, None)
+    return Tracker(full_uri(identity.tracking_uri), identity.experiment, None)
 
 
 def _say_where(checkpoint: Checkpoint, skipped: list[str]) -> None:
     for reason in skipped:
-        Console().print(f"skipped: {reason}", highlight=False)
-    Console().print(f"going on from {checkpoint.folder}", highlight=False, soft_wrap=True)
+        Console().print(f"skipped: {reason}", markup=False, highlight=False, soft_wrap=True)
+    Console().print(f"going on from {checkpoint.folder}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _resumed(
@@ -146,11 +153,12 @@ def _run(folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Che
         result = execute(folder, config, tracker, display, checkpoint, place, finish)
     if result.evaluation is None:
         name = signal.Signals(result.stopped_by).name if result.stopped_by else "a signal"
-        console.print(f"stopped by {name} at {result.env_steps:,} env steps; checkpoint saved", highlight=False)
+        saved = "checkpoint saved" if result.checkpoint else "its checkpoint could not be written"
+        console.print(f"stopped by {name} at {result.env_steps:,} env steps; {saved}", highlight=False)
         console.print(f"go on with: {resume_command(folder)}", highlight=False, soft_wrap=True)
         return 128 + (result.stopped_by or 0)
     console.print(evaluation_table(result.evaluation, config.name))
-    for line in summary_lines(folder, result, tracker.uri, config.env.is_swarm):
+    for line in summary_lines(folder, result, public_uri(tracker.uri), config.env.is_swarm):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     return 0
 

@@ -1,145 +1,180 @@
-"""Checkpoints: folders that are whole or not there, with a checksum of every file.
+"""Checkpoints: whole or not there, with a checksum of every file; a reader trusts only what its manifest vouches for.
 
-A checkpoint is written under another name, its manifest last, every file is synced, and only then is the
-folder renamed into place. A reader trusts nothing that its manifest does not vouch for.
+The nodes write their parts (`actors.parts`), then the driver adds the state and, last, the manifest.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from sim_core.checks import ConfigError
+from actors.locations import Location
+from actors.parts import FileSum
+from learner.checkpoint_store import CheckpointStore, Sized, env_steps_of, open_store
+from learner.manifest import (
+    MANIFEST,
+    MOST_BYTES,
+    STATE,
+    CheckpointError,
+    Manifest,
+    UselessCheckpointError,
+    damaged,
+    decode_manifest,
+    encode_manifest,
+    parse_object,
+)
+from learner.retention import Scored, best_first, names_to_keep
 
-FORMAT = "shoal-checkpoint-3"
-MANIFEST = "manifest.json"
-STATE = "state.json"
-PREFIX = "step-"
-
-
-class CheckpointError(ConfigError):
-    """A checkpoint that cannot be used; the message says why."""
+READ_BYTES = 2**20
 
 
 class Checkpoint(NamedTuple):
-    """A verified checkpoint: its folder and the state of `state.json`."""
+    """A verified checkpoint: where its files lie, and the state of `state.json`."""
 
-    folder: Path
+    folder: Location
     state: dict[str, Any]
 
 
-def write_checkpoint(root: Path, env_steps: int, save_parts: Callable[[Path], dict[str, Any]]) -> Path:
-    """Writes one checkpoint.
+class Keep(NamedTuple):
+    """Which checkpoints stay: the newest so many, and the best so many by the evaluations during training."""
+
+    newest: int
+    best: int
+    scores: list[Scored]
+
+
+def complete_checkpoint(
+    store: CheckpointStore, draft: Location, env_steps: int, state: dict[str, Any], files: dict[str, FileSum]
+) -> Location:
+    """Makes a draft with all parts written a checkpoint.
 
     Args:
-      root: folder of the run's checkpoints.
-      env_steps: env steps so far; names the checkpoint.
-      save_parts: writes the parts' files into the folder it is given and returns the rest of the state.
+      store: the run's checkpoints.
+      draft: where the parts are.
+      env_steps: env steps so far.
+      state: the rest of the state, for JSON.
+      files: the parts' files.
 
     Returns:
-      The checkpoint's folder; an older one of the same step has been replaced.
+      The checkpoint's location.
+
+    Raises:
+      OSError: the storage does not take it; older checkpoints stay as they were.
     """
-    root.mkdir(parents=True, exist_ok=True)
-    final = root / f"{PREFIX}{env_steps:012d}"
-    part = final.with_name(final.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
-    state = save_parts(part)
-    (part / STATE).write_text(json.dumps(state))
-    files = sorted(path for path in part.rglob("*") if path.is_file())
-    sums = {str(path.relative_to(part)): _sha256(path) for path in files}
-    (part / MANIFEST).write_text(json.dumps({"format": FORMAT, "env_steps": env_steps, "sha256": sums}))
-    _sync(part)
-    old = final.with_name(final.name + ".old")
-    if final.exists():
-        shutil.rmtree(old, ignore_errors=True)
-        final.rename(old)  # after a crash between here and the next line it still counts
-    part.rename(final)
-    _sync_folder(root)
-    shutil.rmtree(old, ignore_errors=True)
-    return final
+    text = json.dumps(state).encode()
+    own = FileSum(len(text), hashlib.sha256(text).hexdigest())
+    manifest = encode_manifest(env_steps, {**files, STATE: own})
+    return store.location(store.complete(draft, {STATE: text, MANIFEST: manifest}))
 
 
-def keep_newest(root: Path, count: int) -> None:
-    """Removes all but the `count` newest checkpoints, and what crashed writers left."""
-    for left in set(root.glob(f"{PREFIX}*")) - set(finished_folders(root)):
-        shutil.rmtree(left, ignore_errors=True)
-    for old in finished_folders(root)[count:]:
-        shutil.rmtree(old, ignore_errors=True)
+def keep_checkpoints(store: CheckpointStore, last: Location, keep: Keep) -> None:
+    """Removes all checkpoints but those to keep, and what crashed writers left.
+
+    What calls itself newer than `last`, the one just written, was skipped when the run was resumed: it goes too.
+    """
+    names = store.names()
+    own = names[[store.location(name) for name in names].index(last) :]
+    kept = names_to_keep([(name, env_steps_of(name)) for name in own], keep.newest, keep.best, keep.scores)
+    store.remove([name for name in names if name not in kept])
 
 
-def read_checkpoint(folder: Path) -> Checkpoint:
+def read_checkpoint(store: CheckpointStore, name: str) -> Checkpoint:
     """Verifies every file of a checkpoint and reads its state.
 
     Raises:
-      CheckpointError: it is missing, incomplete, damaged, or of another format.
+      UselessCheckpointError: it is incomplete, damaged, or of an older format.
+      CheckpointError: it is of a newer format.
     """
-    if not folder.is_dir():
-        raise CheckpointError(f"there is no checkpoint {folder}; name a run or a folder under its checkpoints")
+    location = store.location(name)
+    manifest = decode_manifest(_small_file(store, name, MANIFEST), location)
+    _verify(store, name, manifest)
+    state = parse_object(_small_file(store, name, STATE))
+    if state is None:
+        raise damaged(location, f"{STATE} is no JSON object")
+    return Checkpoint(location, state)
+
+
+def _open(store: CheckpointStore, name: str, file: str) -> Sized:
     try:
-        manifest = json.loads((folder / MANIFEST).read_text())
-        found = manifest["format"]
-        sums: dict[str, str] = manifest["sha256"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(
-            f"checkpoint {folder} has no readable manifest; use an older one or train anew"
-        ) from error
-    if found != FORMAT:
-        raise CheckpointError(f"checkpoint {folder} is in format {found!r}, this version reads {FORMAT}")
-    if not isinstance(sums, dict) or STATE not in sums:
-        raise CheckpointError(f"checkpoint {folder} is damaged ({MANIFEST}); use an older one or train anew")
-    for name, expected in sums.items():
-        path = folder / name
-        if not path.is_file() or _sha256(path) != expected:
-            raise CheckpointError(f"checkpoint {folder} is damaged ({name}); use an older one or train anew")
-    return Checkpoint(folder, json.loads((folder / STATE).read_text()))
+        return store.open(name, file)
+    except (OSError, ValueError) as error:
+        raise damaged(store.location(name), f"{file}: {error}") from error
 
 
-def newest_valid(root: Path) -> tuple[Checkpoint, list[str]]:
+def _small_file(store: CheckpointStore, name: str, file: str) -> bytes:
+    opened, size = _open(store, name, file)
+    with opened:
+        if size > MOST_BYTES:
+            raise damaged(store.location(name), f"{file} has {size} bytes, more than {MOST_BYTES}")
+        return opened.read(MOST_BYTES)
+
+
+def _verify(store: CheckpointStore, name: str, manifest: Manifest) -> None:
+    for file, expected in manifest.files.items():
+        opened, size = _open(store, name, file)
+        with opened:
+            if size != expected.size:
+                raise damaged(store.location(name), f"{file}: {size} bytes, not {expected.size}")
+            digest = hashlib.sha256()
+            try:
+                while block := opened.read(READ_BYTES):
+                    digest.update(block)
+            except OSError as error:
+                raise damaged(store.location(name), f"{file}: {error}") from error
+        if digest.hexdigest() != expected.sha256:
+            raise damaged(store.location(name), f"{file}: its content has another checksum")
+
+
+def newest_valid(root: Location) -> tuple[Checkpoint, list[str]]:
     """The newest checkpoint that passes, and why newer ones were skipped.
 
     Raises:
-      CheckpointError: there is none.
+      UselessCheckpointError: there is none, or all are damaged or too old.
+      CheckpointError: the storage does not answer, or none passes and one is of a newer format.
     """
-    skipped: list[str] = []
-    for folder in finished_folders(root):
-        try:
-            return read_checkpoint(folder), skipped
-        except CheckpointError as error:
-            skipped.append(str(error))
-    reason = f": {skipped[0]}" if skipped else ""
-    raise CheckpointError(f"no usable checkpoint in {root}{reason}")
+    store, names = _listed(root)
+    return _first_valid(root, store, names)
 
 
-def finished_folders(root: Path) -> list[Path]:
-    """Finished checkpoints, newest first; one that was being replaced counts until its successor is in place."""
-    names = (path for path in root.glob(f"{PREFIX}*") if path.is_dir() and path.suffix != ".part")
-    return sorted((path for path in names if not (path.suffix and path.with_suffix("").exists())), reverse=True)
+def best_valid(root: Location, scores: list[Scored]) -> tuple[Checkpoint, list[str]]:
+    """The checkpoint that did best in the evaluations during training and passes, and why better ones were skipped.
+
+    Raises:
+      CheckpointError: as for `newest_valid`; or no checkpoint has been evaluated.
+    """
+    store, names = _listed(root)
+    best = best_first([(name, env_steps_of(name)) for name in names], scores)
+    if names and not best:
+        raise CheckpointError(f"no checkpoint in {root} is as old as an evaluation; use the newest one")
+    return _first_valid(root, store, best)
 
 
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def finished_names(root: Location) -> list[str]:
+    """Names of the finished checkpoints, newest first; whether they are whole, a reader finds out.
+
+    Raises:
+      CheckpointError: the storage does not answer.
+    """
+    return _listed(root)[1]
 
 
-def _sync(folder: Path) -> None:
-    for path in folder.rglob("*"):
-        if path.is_file():
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
-        else:
-            _sync_folder(path)
-    _sync_folder(folder)
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
+def _listed(root: Location) -> tuple[CheckpointStore, list[str]]:
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        store = open_store(root)
+        return store, store.names()
+    except OSError as error:
+        raise CheckpointError(f"the checkpoints at {root} cannot be listed: {error}") from error
+
+
+def _first_valid(root: Location, store: CheckpointStore, names: list[str]) -> tuple[Checkpoint, list[str]]:
+    skipped: list[CheckpointError] = []
+    for name in names:
+        try:
+            return read_checkpoint(store, name), [str(error) for error in skipped]
+        except CheckpointError as error:
+            skipped.append(error)
+    reason = f": {skipped[0]}" if skipped else ""
+    useless = all(isinstance(error, UselessCheckpointError) for error in skipped)
+    kind = UselessCheckpointError if useless else CheckpointError
+    raise kind(f"no usable checkpoint in {root}{reason}")

@@ -236,6 +236,13 @@ def to_dict(config: RunConfig) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+def flat_params(config: RunConfig) -> dict[str, Any]:
+    """The whole config under flat names; the world's fields and the run's have no name in common."""
+    values = to_dict(config)
+    world: dict[str, Any] = values.pop("world")
+    return values | world
+
+
 def from_dict(values: dict[str, Any]) -> RunConfig:
     """The config of nested plain values.
 

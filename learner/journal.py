@@ -59,6 +59,11 @@ class Journal:
         self._file.write(json.dumps(row).encode() + b"\n")
         self._file.flush()
 
+    @property
+    def length(self) -> int:
+        """Bytes of all rows so far."""
+        return self._file.tell()
+
     def sync(self) -> int:
         """Makes all rows durable; returns the file's length in bytes."""
         self._file.flush()
@@ -79,12 +84,18 @@ class Journal:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The whole rows of a journal that another process may be writing; none where there is no journal yet."""
+    """The whole rows of a journal that another process may be writing; none where there is no journal yet.
+
+    Raises:
+      ConfigError: the file cannot be read or holds something else.
+    """
     try:
         lines = path.read_bytes().split(b"\n")[:-1]  # the last one may be unfinished
+        return [Row(*json.loads(line)) for line in lines]
     except FileNotFoundError:
         return []
-    return [Row(*json.loads(line)) for line in lines]
+    except (OSError, ValueError, TypeError) as error:
+        raise ConfigError(f"the metrics {path} cannot be read ({error}); put the whole file back") from error
 
 
 class PushedMark:

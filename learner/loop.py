@@ -7,43 +7,39 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Protocol
 
 from actors.calls import Ref
 from actors.evaluator import evaluate, evaluate_in_parts
 from actors.exploration import epsilon
 from actors.faults import CallFailed, Part, PartFailed, PartKind, Recovery, RunFailed
+from actors.locations import Location
 from actors.network import WeightsSnapshot
 from actors.transitions import BlockReport, EpisodeStats
-from learner.checkpoint import Checkpoint, keep_newest, write_checkpoint
+from learner.checkpoint import Checkpoint
+from learner.checkpointer import Checkpointer
 from learner.cluster import Cluster
-from learner.config import RunConfig, config_hash
-from learner.journal import ACCOUNT, Journal, Row
+from learner.config import RunConfig
+from learner.journal import Journal, Row
 from learner.ledger import Ledger
 from learner.mending import FaultObserver, Mender, RunLost
-from learner.meters import Meters
 from learner.node import UpdateReport
-from learner.pacing import PacingState, make_pacer
+from learner.pacing import make_pacer
+from learner.progress import Progress
 from learner.results import as_metrics, summarise
+from learner.saver import LEARNER, SaveObserver, Saver
 from learner.under_way import Pending, UnderWay
 
 EVAL_SEED = 1_000_000_000
 """First seed of evaluations during training; training worlds draw theirs from other streams."""
+EVALUATOR = Part(PartKind.EVALUATOR)
 
 
-LEARNER, EVALUATOR = Part(PartKind.LEARNER), Part(PartKind.EVALUATOR)
-
-
-class Observer(FaultObserver, Protocol):
+class Observer(FaultObserver, SaveObserver, Protocol):
     """What the loop tells its surroundings."""
 
     def row(self, row: Row) -> None:
         """A row of metrics was written."""
-        ...
-
-    def checkpoint(self, folder: Path, journal_offset: int) -> None:
-        """A checkpoint is whole; rows up to the offset are covered by it."""
         ...
 
 
@@ -54,10 +50,11 @@ class TrainingLoop:
       config: the run.
       cluster: its parts.
       journal: where metrics go.
-      checkpoints: folder of the run's checkpoints.
+      checkpoints: folder or URL of the run's checkpoints.
       observer: is told of rows and checkpoints.
       stop: asked once a round; True ends the run early, with a checkpoint.
       recovery: decides about failed parts; remembers their failures in earlier attempts.
+      keep_best: the best checkpoints that are kept beside the newest.
     """
 
     def __init__(
@@ -65,29 +62,41 @@ class TrainingLoop:
         config: RunConfig,
         cluster: Cluster,
         journal: Journal,
-        checkpoints: Path,
+        checkpoints: Location,
         observer: Observer,
         stop: Callable[[], bool],
         recovery: Recovery | None = None,
+        keep_best: int = 0,
     ) -> None:
         self._config = config
         self._cluster = cluster
         self._calls = cluster.calls
         self._journal = journal
-        self._checkpoints = checkpoints
         self._observer = observer
         self._stop = stop
         self._pacer = make_pacer(config, cluster.blocks_in_flight)
-        self._meters = Meters()
         self._ledger = Ledger(len(cluster.workers), cluster.capacities(config))
+        self._progress = Progress(config, self._pacer, self._ledger)
         self._under_way = UnderWay(len(cluster.workers), cluster.deadline_s, cluster.start_deadline_s)
         self._mender = Mender(cluster, recovery or Recovery(), self._under_way, self._pacer, self._ledger, observer)
+        checkpointer = Checkpointer(checkpoints, cluster.calls, cluster.start_deadline_s)
+        self._saver = Saver(config, keep_best, checkpointer, self._mender, self._progress, journal, observer)
         self._weights: Ref = None
-        self.env_steps = 0
-        self.updates = 0
-        self._saved_at: tuple[int, int] | None = None
-        self._due = {"log": config.log_every_env_steps, "eval": config.eval_every_env_steps}
-        self._due["checkpoint"] = config.checkpoint_every_env_steps
+
+    @property
+    def env_steps(self) -> int:
+        """Env steps so far."""
+        return self._progress.env_steps
+
+    @property
+    def updates(self) -> int:
+        """Updates so far."""
+        return self._progress.updates
+
+    @property
+    def saved(self) -> Location | None:
+        """The checkpoint of this very moment; None if it has not been written."""
+        return self._saver.saved
 
     def run(self) -> bool:
         """Trains to `total_env_steps` or until stopped, and checkpoints the end.
@@ -101,38 +110,40 @@ class TrainingLoop:
           RunFailed: a part fails again and again.
           PartFailed: a part failed before the first round.
         """
+        try:
+            return self._run()
+        except Exception:
+            self._saver.give_up()  # what writes must not outlive its run: another attempt may begin at once
+            raise
+
+    def _run(self) -> bool:
         if self._weights is None:
             self._send_first_weights()
-        self._meters.start_clock()
+        self._progress.meters.start_clock()
         while self.env_steps < self._config.total_env_steps and not self._stop():
-            if self._is_due("eval", self._config.eval_every_env_steps):
+            if not self._evaluates_before_checkpoint() and self._progress.is_due("eval"):
                 self._start_evaluation()  # after the last round's checkpoint, which would wait for it
             self._start_collects()  # act, step, store: the workers push to the shards
             self._start_updates()  # sample, update, publish: when the pacer says so
             self._take_results()
-            if self._is_due("log", self._config.log_every_env_steps):
-                self._write_row(self._training_row())
-            if self._is_due("checkpoint", self._config.checkpoint_every_env_steps):
-                self.checkpoint()
-        if self._saved_at != (self.env_steps, self.updates):
-            self.checkpoint()
+            if self._progress.is_due("log"):
+                self._write_row(self._progress.row())
+            self._tend_checkpoints()  # a snapshot while nothing is under way; it is written meanwhile
+        self._save_the_end()
         return self.env_steps >= self._config.total_env_steps
 
     def _send_first_weights(self) -> None:
         self._weights = self._mender.ask(LEARNER, "weights")[0]
-        for worker in self._workers():
+        for worker in self._mender.workers:
             try:
                 self._mender.ask(worker, "set_weights", self._weights)
             except PartFailed as failure:
                 self._mend(failure)
 
-    def _workers(self) -> list[Part]:
-        return [Part(PartKind.WORKER, worker_id) for worker_id in range(len(self._cluster.workers))]
-
     def _start_collects(self) -> None:
         config = self._config
         for _ in range(self._cluster.collects_in_flight):
-            for part in self._workers():
+            for part in self._mender.workers:
                 worker_id = part.number
                 if self._under_way.collects[worker_id] >= self._cluster.collects_in_flight:
                     continue
@@ -200,23 +211,20 @@ class TrainingLoop:
 
     def _mend(self, failure: PartFailed) -> None:
         unreported = self._mender.mend(failure, self._weights)
-        self.env_steps += unreported.env_steps
+        self._progress.env_steps += unreported.env_steps
         if failure.part == EVALUATOR:
             self._start_evaluation()
 
     def _take_blocks(self, reports: list[BlockReport]) -> None:
         for report in reports:
             self._under_way.blocks[report.header.worker_id] -= 1
-            self._pacer.inserted(self._ledger.take(report))
-            self._meters.take_block(report)
-            self.env_steps += report.header.env_steps
+            self._progress.take_block(report)
             failure = self._mender.check_push(report)
             if failure is not None:
                 self._mend(failure)
 
     def _take_updates(self, report: UpdateReport, updates: int) -> None:
-        self._meters.take_updates(report, updates)
-        self.updates = report.version
+        self._progress.take_updates(report, updates)
         self._weights = report.weights[0]
 
     def _take_evaluation(self, stats: EpisodeStats, env_steps: int) -> None:
@@ -228,87 +236,53 @@ class TrainingLoop:
         self._journal.append(row)
         self._observer.row(row)
 
-    def _training_row(self) -> dict[str, float]:
-        row = self._meters.row(self._ledger.replay_size, self._pacer.ratio()) | self._ledger.row()
-        pacing = self._pacer.state
-        counts = {
-            "sampled": pacing.sampled,
-            "updates": self.updates,
-            "waits_to_insert": pacing.waits_to_insert,
-            "waits_to_sample": pacing.waits_to_sample,
-        }
-        return row | {f"{ACCOUNT}{name}": float(count) for name, count in counts.items()}
-
-    def _is_due(self, what: str, every: int) -> bool:
-        """Whether `env_steps` has passed the next multiple of `every`; moves on to the one after."""
-        if self.env_steps < self._due[what]:
-            return False
-        self._due[what] = (self.env_steps // every + 1) * every
-        return True
-
     def settle(self) -> None:
         """Waits until nothing is under way anywhere."""
         while self._under_way:
             self._take_results()
-        for worker in self._workers():
+        for worker in self._mender.workers:
             try:
                 self._take_blocks(self._mender.ask(worker, "settle"))
             except PartFailed as failure:
                 self._mend(failure)  # a new worker has nothing under way
 
-    def checkpoint(self) -> Path:
-        """Writes a checkpoint of the whole run at a moment when nothing is under way."""
-        while True:
-            try:
-                return self._checkpoint()
-            except PartFailed as failure:
-                self._mend(failure)
+    def _evaluates(self) -> bool:
+        return self._under_way.count("eval") > 0
 
-    def _checkpoint(self) -> Path:
+    def _evaluates_before_checkpoint(self) -> bool:
+        """Whether a checkpoint waits for an evaluation to end, so that no other may begin."""
+        return self._saver.is_wanted and self._evaluates()
+
+    def _tend_checkpoints(self) -> None:
+        """Tells of a checkpoint that has ended; begins one that is due, once none and no evaluation is under way."""
+        self._mend_if(self._saver.poll())
+        self._saver.is_wanted |= self._progress.is_due("checkpoint")
+        if self._saver.may_begin and not self._evaluates():
+            self.checkpoint()
+
+    def _save_the_end(self) -> None:
+        """Writes a checkpoint of this moment, again where a part fails meanwhile."""
+        self._mend_if(self._saver.wait())
+        self._saver.is_wanted = self.saved is None
+        while self._saver.is_wanted:
+            self.checkpoint()
+            self._mend_if(self._saver.wait())
+
+    def checkpoint(self) -> None:
+        """Begins a checkpoint of the whole run at a moment when nothing is under way; none may be being written."""
         self.settle()
-        offset = self._journal.sync()
-        folder = write_checkpoint(self._checkpoints, self.env_steps, lambda part: self._save(part, offset))
-        keep_newest(self._checkpoints, self._config.keep_checkpoints)
-        self._observer.checkpoint(folder, offset)
-        self._saved_at = (self.env_steps, self.updates)
-        return folder
+        try:
+            self._saver.begin()
+        except PartFailed as failure:
+            self._mend(failure)
 
-    def _save(self, folder: Path, journal_offset: int) -> dict[str, Any]:
-        learner = self._mender.ask(LEARNER, "save", folder)
-        workers = [
-            self._mender.ask(worker, "save", folder / f"worker-{worker.number}.safetensors")
-            for worker in self._workers()
-        ]
-        return {
-            "config_hash": config_hash(self._config),
-            "env_steps": self.env_steps,
-            "updates": self.updates,
-            "incarnation": self._mender.highest,
-            "pacing": self._pacer.state._asdict(),
-            "meters": self._meters.get_state(),
-            "ledger": self._ledger.get_state(),
-            "due": self._due,
-            "journal_offset": journal_offset,
-            "learner": learner,
-            "workers": workers,
-        }
+    def _mend_if(self, failure: PartFailed | None) -> None:
+        if failure is not None:
+            self._mend(failure)
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Takes up a checkpoint of this config; call before `run`.
-
-        Raises:
-          ValueError: its files do not fit this run.
-        """
-        folder, state = checkpoint
-        self._weights = self._mender.ask(LEARNER, "load", folder, state["learner"])[0]
-        for worker in self._workers():
-            i = worker.number
-            self._mender.ask(worker, "load", folder / f"worker-{i}.safetensors", state["workers"][i])
-        self.env_steps, self.updates = state["env_steps"], state["updates"]
-        self._pacer.state = PacingState(**state["pacing"])
-        self._meters.set_state(state["meters"])
-        self._ledger.set_state(state["ledger"])
-        self._due = dict(state["due"])
+        """Takes up a checkpoint of this config; call before `run` (see `Saver.restore` for errors)."""
+        self._weights = self._saver.restore(checkpoint)
 
     def lost(self, failure: PartFailed) -> RunLost:
         """Ends this attempt because of a failure outside of the rounds of training (see `run` for other errors)."""

@@ -83,15 +83,31 @@ class Mender:
             return self._cluster.learner
         return (self._cluster.workers if part.kind is PartKind.WORKER else self._cluster.targets)[part.number]
 
+    @property
+    def workers(self) -> list[Part]:
+        """The rollout workers."""
+        return [Part(PartKind.WORKER, worker_id) for worker_id in range(len(self._cluster.workers))]
+
     def ask(self, part: Part, method: str, *args: Any) -> Any:
         """Calls a part and waits for the answer.
 
         Raises:
           PartFailed: there is none.
         """
+        return self.ask_all(method, {part: args})[0]
+
+    def ask_all(self, method: str, args: dict[Part, tuple[Any, ...]]) -> list[Any]:
+        """Calls several parts at once, each with its own arguments, and waits for their answers, in order.
+
+        Raises:
+          PartFailed: one is missing.
+        """
+        refs = {part: self._cluster.calls.start(self.node(part), method, *given) for part, given in args.items()}
+        return [self._answer(part, method, ref) for part, ref in refs.items()]
+
+    def _answer(self, part: Part, method: str, ref: Ref) -> Any:
         calls = self._cluster.calls
         patience_s = self._cluster.start_deadline_s if method in SLOW else self._under_way.patience_with(part)
-        ref = calls.start(self.node(part), method, *args)
         try:
             if not calls.wait([ref], patience_s):
                 raise CallFailed(Fault.LATE, f"silent for {patience_s:.0f} s")

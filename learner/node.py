@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,12 +13,16 @@ from safetensors.torch import load_file, save_file
 
 from actors.calls import Calls, Node, Ref
 from actors.faults import CallFailed, Part, PartFailed, PartKind
+from actors.locations import Location, fetched, inside
 from actors.nodes import ShardNode
+from actors.parts import PartWriter, Written, join_written
 from actors.transitions import AddReply, Delivered, Draws, SampleReply, TransitionBlock
 from learner.double_dqn import importance_weights
 from learner.learner import Learner, LearnerSettings, UpdateStats
 
 SLOW_CALL_S = 3_600.0
+WEIGHTS = "learner.safetensors"
+"""File of networks and optimiser in a checkpoint."""
 
 
 class UpdateReport(NamedTuple):
@@ -47,7 +50,7 @@ class LearnerNode:
 
     Args:
       settings: see LearnerSettings.
-      shards: nodes with `sample`, `set_priorities`, `publish`, `mass`, `save`, `load`.
+      shards: nodes with `sample`, `set_priorities`, `publish`, `mass`, `save`, `saved`, `load`.
       shard_calls: how to call the shards.
       calls: how to share weights with rollout workers.
     """
@@ -64,6 +67,7 @@ class LearnerNode:
         self._masses = np.zeros(len(shards), np.float64)
         self._answers: dict[int, Ref] = {}
         self._weights: Ref = None
+        self._writer = PartWriter()
         self.publish()
 
     def add(self, block: TransitionBlock) -> AddReply:
@@ -97,7 +101,7 @@ class LearnerNode:
             raise PartFailed(part, self._shard_incarnations[index], failure.fault, failure.reason) from failure
 
     def _slow_result(self, index: int, ref: Ref) -> Any:
-        """`_result` of a call that writes or reads a whole shard; the caller's deadline is for all of them."""
+        """`_result` of a call that reads a whole shard; the caller's deadline is for all of them."""
         self._shard_calls.wait([ref], SLOW_CALL_S)
         return self._result(index, ref)
 
@@ -167,30 +171,59 @@ class LearnerNode:
         refs = [self._shard_calls.start(shard, method) for shard in self._shards]
         return [self._result(i, ref) for i, ref in enumerate(refs)]
 
-    def save(self, folder: Path) -> dict[str, Any]:
-        """Writes learner and shards into `folder`; returns the rest of their state, for JSON."""
+    def save(self, folder: Location) -> dict[str, Any]:
+        """Starts to write learner and shards, as they are now, into `folder`; `saved` tells of its end.
+
+        Returns:
+          The rest of their state, for JSON.
+
+        Raises:
+          PartFailed: a shard failed.
+        """
         self._take_answers()
-        save_file(self._learner.get_state(), str(folder / "learner.safetensors"))
+        tensors = self._learner.get_state()
+        self._writer.start(inside(folder, WEIGHTS), lambda path: save_file(tensors, str(path)))
         refs = [
-            self._shard_calls.start(shard, "save", folder / f"shard-{i}.zarr") for i, shard in enumerate(self._shards)
+            self._shard_calls.start(shard, "save", inside(folder, f"shard-{i}.zarr"))
+            for i, shard in enumerate(self._shards)
         ]
-        shards = [self._slow_result(i, ref) for i, ref in enumerate(refs)]
+        shards = [self._result(i, ref) for i, ref in enumerate(refs)]
         return {"shards": shards, "rng": self._rng.bit_generator.state, "sizes": self._masses.tolist()}
 
-    def load(self, folder: Path, state: dict[str, Any]) -> list[Ref]:
+    def saved(self) -> Written | None:
+        """How the last `save` ended, all shards included; None while something of it is being written.
+
+        Raises:
+          PartFailed: a shard failed, and the others have written.
+        """
+        parts, failures = [self._writer.result()], []
+        refs = [self._shard_calls.start(shard, "saved") for shard in self._shards]
+        for i, ref in enumerate(refs):
+            try:
+                parts.append(self._result(i, ref))
+            except PartFailed as failure:
+                failures.append(failure)
+        written = join_written(parts)
+        if written is not None and failures:
+            raise failures[0]
+        return written
+
+    def load(self, folder: Location, state: dict[str, Any]) -> list[Ref]:
         """Takes up what `save` wrote and returned; publishes the weights (see `publish`).
 
         Raises:
           ValueError: the files are damaged or do not fit this run.
         """
+        location = inside(folder, WEIGHTS)
         try:
-            self._learner.set_state(load_file(str(folder / "learner.safetensors")))
+            with fetched(location) as path:
+                self._learner.set_state(load_file(str(path)))
         except (SafetensorError, OSError, KeyError) as error:
-            raise ValueError(f"{folder / 'learner.safetensors'} cannot be read ({error})") from error
+            raise ValueError(f"{location} cannot be read ({error})") from error
         if len(state["shards"]) != len(self._shards):
             raise ValueError(f"the checkpoint has {len(state['shards'])} shards, this run {len(self._shards)}")
         refs = [
-            self._shard_calls.start(shard, "load", folder / f"shard-{i}.zarr", shard_state)
+            self._shard_calls.start(shard, "load", inside(folder, f"shard-{i}.zarr"), shard_state)
             for i, (shard, shard_state) in enumerate(zip(self._shards, state["shards"], strict=True))
         ]
         for i, ref in enumerate(refs):

@@ -8,10 +8,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from actors.locations import fetched, inside
 from actors.network import NETWORKS, DuelingNetwork, QNetwork, WeightsSnapshot, load_snapshot, snapshot
 from actors.vector_env import EnvShape
-from learner.checkpoint import Checkpoint, CheckpointError
+from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
+from learner.manifest import CheckpointError, damaged
+from learner.node import WEIGHTS
 
 ONLINE = "online."
 
@@ -22,8 +25,12 @@ def read_policy(checkpoint: Checkpoint, config: RunConfig, shape: EnvShape) -> W
     Raises:
       CheckpointError: the weights do not fit a network of `config` on environments of `shape`.
     """
+    updates = checkpoint.state.get("updates")
+    if type(updates) is not int:
+        raise damaged(checkpoint.folder, "state.json has no number of updates")
     network = NETWORKS[config.network](shape.observation_size, config.hidden_sizes, shape.num_actions)
-    return _read(checkpoint.folder / "learner.safetensors", checkpoint.state["updates"], network)
+    with fetched(inside(checkpoint.folder, WEIGHTS)) as path:
+        return _read(path, updates, network)
 
 
 def save_policy(path: Path, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> None:
@@ -55,7 +62,7 @@ def _read(path: Path, updates: int, network: QNetwork | DuelingNetwork) -> Weigh
         network.load_state_dict(_online(load_file(str(path))))
     except (RuntimeError, OSError, SafetensorError) as error:
         raise CheckpointError(
-            f"the policy of {path.parent} takes other observations or actions than this setup: name a run whose "
+            f"the policy {path} takes other observations or actions than this setup: name a run whose "
             "hidden_sizes, network, sectors, stop_action and sensor_counts (for M_IN and M_OUT also method and groups) "
             "are those of its config"
         ) from error

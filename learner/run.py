@@ -4,30 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import closing
-from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from actors.faults import Decision, Mended, PartFailed, Recovery
+from actors.locations import Location
 from actors.network import WeightsSnapshot
 from actors.transitions import EpisodeStats
-from learner.checkpoint import Checkpoint, CheckpointError, newest_valid
+from learner.addresses import hide_secrets
+from learner.checkpoint import Checkpoint, newest_valid
 from learner.cluster import Cluster, process_cluster
-from learner.config import RunConfig, config_hash
+from learner.config import RunConfig
 from learner.delivery import Delivery, first_line, insist
 from learner.fault_log import FaultLog
 from learner.journal import Journal, PushedMark, Row
 from learner.loop import TrainingLoop
+from learner.manifest import CheckpointError, UselessCheckpointError
 from learner.mending import RunLost
 from learner.place import Place
 from learner.ray_edge import ray_cluster
 from learner.ray_metrics import RayMetrics
 from learner.results import Evaluation, final_metrics, summarise
 from learner.run_folder import RunFolder
+from learner.saved_state import check_config, check_state
 from learner.stopping import stop_on_signals
 from learner.tracker import TROUBLE, Tracker
 
 LAST_FLUSH_S = 5.0
 """How long a stopped run waits for MLflow; the next sitting delivers what it did not take."""
+
+MISFITS = (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError)
+"""What taking up a state of the wrong shape raises; a checksum cannot tell that it was written to do harm."""
 
 
 class Display(Protocol):
@@ -43,10 +49,14 @@ class Display(Protocol):
 
 
 class RunResult(NamedTuple):
-    """How a run ended; `evaluation`, its `episodes` and `weights` are None if a signal stopped it before its end."""
+    """How a run ended; `evaluation`, its `episodes` and `weights` are None if a signal stopped it before its end.
+
+    `checkpoint` is the location of the checkpoint of its end, None if that could not be written.
+    """
 
     env_steps: int
     updates: int
+    checkpoint: Location | None
     stopped_by: int | None
     evaluation: Evaluation | None
     episodes: EpisodeStats | None
@@ -88,9 +98,13 @@ class MirroringObserver:
         self._display.row(row)
         self._monitor(row)
 
-    def checkpoint(self, folder: Path, journal_offset: int) -> None:
+    def checkpoint(self, folder: Location, journal_offset: int) -> None:
         """Asks for the delivery of the rows that the checkpoint covers."""
         self._delivery.up_to(journal_offset)
+
+    def checkpoint_failed(self, env_steps: int, reason: str) -> None:
+        """Says so; the next checkpoint is tried as usual."""
+        self._display.message(f"the checkpoint of {env_steps:,} env steps could not be written: {reason}")
 
     def failed(self, failure: PartFailed, decision: Decision) -> None:
         """Logs and shows a failure."""
@@ -114,15 +128,25 @@ def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list
     """The newest usable checkpoint of a run, and why newer ones were skipped.
 
     Raises:
-      CheckpointError: there is none, or it belongs to another config.
+      UselessCheckpointError: there is none, or all are damaged or too old.
+      CheckpointError: it cannot be reached, is of a newer version, or belongs to another config.
     """
-    checkpoint, skipped = newest_valid(folder.checkpoints)
-    if checkpoint.state["config_hash"] != config_hash(config):
-        raise CheckpointError(
-            f"checkpoint {checkpoint.folder} was made with another config than {folder.path / 'config.json'}: "
-            "only total_env_steps, engine and device may change between two sittings"
-        )
+    checkpoint, skipped = newest_valid(folder.checkpoint_location())
+    check_state(checkpoint)
+    check_config(checkpoint, config, folder.path / "config.json")
     return checkpoint, skipped
+
+
+def last_checkpoint(folder: RunFolder, config: RunConfig) -> Checkpoint | None:
+    """The newest checkpoint of an earlier attempt; None where there is none of use, and the run begins anew.
+
+    Raises:
+      CheckpointError: it cannot be reached, is of a newer version, or belongs to another config.
+    """
+    try:
+        return resume_point(folder, config)[0]
+    except UselessCheckpointError:
+        return None
 
 
 def execute(
@@ -151,31 +175,36 @@ def execute(
     Raises:
       RunFailed: a part of it fails again and again.
     """
-    status = "FAILED"
+    status, say = "FAILED", _without_secrets(display, tracker)
     try:
         result, rows = _train(folder, config, tracker, display, checkpoint, place)
         if result.evaluation is not None:
             patience_s = tracker.patience_s
             time_ms = rows[-1].time_ms if rows else tracker.started_ms
             metrics = final_metrics(result.evaluation)
-            insist(lambda: tracker.final(metrics, time_ms), "the results", patience_s, display.message)
-            insist(lambda: finish(result, rows), "the artifacts", patience_s, display.message)
+            insist(lambda: tracker.final(metrics, time_ms), "the results", patience_s, say)
+            insist(lambda: finish(result, rows), "the artifacts", patience_s, say)
         status = "FINISHED" if result.stopped_by is None else "KILLED"
         return result
     except KeyboardInterrupt:
         status = "KILLED"
         raise
     finally:
-        _end(tracker, status, display)
+        _end(tracker, status, say)
 
 
-def _end(tracker: Tracker, status: str, display: Display) -> None:
+def _without_secrets(display: Display, tracker: Tracker) -> Callable[[str], None]:
+    """Shows what is said of MLflow, whose errors name its address, to a person."""
+    return lambda text: display.message(hide_secrets(text, tracker.uri))
+
+
+def _end(tracker: Tracker, status: str, say: Callable[[str], None]) -> None:
     """Closes the MLflow run; one that cannot be closed is so by the next sitting."""
     patience_s = tracker.patience_s if status == "FINISHED" else 0.0
     try:
-        insist(lambda: tracker.end(status), f"that the run is {status}", patience_s, display.message)
+        insist(lambda: tracker.end(status), f"that the run is {status}", patience_s, say)
     except TROUBLE as error:
-        display.message(f"MLflow does not know that the run is {status}: {first_line(error)}")
+        say(f"MLflow does not know that the run is {status}: {first_line(error)}")
 
 
 def _train(
@@ -187,7 +216,7 @@ def _train(
     place: Place,
 ) -> tuple[RunResult, list[Row]]:
     """Trains to the end, going back to the last checkpoint whenever a part is gone that only it can bring back."""
-    recovery, faults = Recovery(), FaultLog(folder.faults)
+    recovery, faults, say = Recovery(), FaultLog(folder.faults), _without_secrets(display, tracker)
     incarnation = checkpoint.state["incarnation"] + 1 if checkpoint else 0
     resumed = checkpoint is not None
     monitor: Callable[[Row], None] | None = None
@@ -196,7 +225,7 @@ def _train(
         with closing(Journal(folder.journal, offset)) as journal:
             cluster = open_cluster(config, incarnation, place)
             monitor = monitor or _monitor(folder, config)
-            delivery = Delivery(tracker, journal, PushedMark(folder.pushed, offset), display.message)
+            delivery = Delivery(tracker, journal, PushedMark(folder.pushed, offset), say)
             delivery.up_to(offset)
             with closing(delivery):
                 observer = MirroringObserver(delivery, faults, display, monitor, resumed)
@@ -206,31 +235,27 @@ def _train(
                     incarnation = lost.incarnation + 1
                 else:
                     cluster.close()  # not after an error: references in its traceback must not outlive Ray
-                    _deliver_rest(delivery, tracker, result, display)
-                    return result, journal.rows()
+                    rows = journal.rows()
+                    if result.evaluation is not None:
+                        delivery.up_to(journal.length)  # even if the end has no checkpoint
+                    _deliver_rest(delivery, tracker, result, say)
+                    return result, rows
         cluster.abandon()
         resumed = False
-        checkpoint = _last_checkpoint(folder, config)
+        checkpoint = last_checkpoint(folder, config)
         display.message(f"going on from {checkpoint.folder if checkpoint else 'the start'}")
 
 
-def _last_checkpoint(folder: RunFolder, config: RunConfig) -> Checkpoint | None:
-    try:
-        return resume_point(folder, config)[0]
-    except CheckpointError:
-        return None  # lost before its first one
-
-
-def _deliver_rest(delivery: Delivery, tracker: Tracker, result: RunResult, display: Display) -> None:
+def _deliver_rest(delivery: Delivery, tracker: Tracker, result: RunResult, say: Callable[[str], None]) -> None:
     left = delivery.flush(LAST_FLUSH_S if result.stopped_by is not None else max(LAST_FLUSH_S, tracker.patience_s))
     if left is not None:
-        display.message(f"MLflow lacks the newest metrics, which `shoal resume` sends again: {left}")
+        say(f"MLflow lacks the newest metrics, which `shoal resume` sends again: {left}")
 
 
 def _restore(loop: TrainingLoop, checkpoint: Checkpoint) -> None:
     try:
         loop.restore(checkpoint)
-    except ValueError as error:
+    except MISFITS as error:
         cause = getattr(error, "cause", error)  # what a Ray actor raised stands behind Ray's own error
         raise CheckpointError(f"checkpoint {checkpoint.folder} does not fit this run: {cause}") from error
 
@@ -256,17 +281,18 @@ def _attempt(
       RunLost: a part is gone that only a checkpoint can bring back.
     """
     with stop_on_signals() as stop:
-        loop = TrainingLoop(config, cluster, journal, folder.checkpoints, observer, stop, recovery)
+        keep_best = folder.storage().keep_best
+        loop = TrainingLoop(config, cluster, journal, folder.checkpoint_location(), observer, stop, recovery, keep_best)
         try:
             if checkpoint is not None:
                 _restore(loop, checkpoint)
             observer.ready()
             finished = loop.run()
             if not finished:
-                return RunResult(loop.env_steps, loop.updates, stop.signal, None, None, None)
+                return RunResult(loop.env_steps, loop.updates, loop.saved, stop.signal, None, None, None)
             display.message(f"training done; evaluating {config.final_eval_episodes} greedy episodes")
             weights = loop.newest_weights()
             episodes = loop.final_evaluation(weights)
         except PartFailed as failure:  # outside of the rounds of training
             raise loop.lost(failure) from failure
-        return RunResult(loop.env_steps, loop.updates, None, summarise(episodes), episodes, weights)
+        return RunResult(loop.env_steps, loop.updates, loop.saved, None, summarise(episodes), episodes, weights)

@@ -10,8 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from actors.locations import Location, as_location
 from learner.config import RunConfig, from_dict, to_dict
-from sim_core.checks import ConfigError
+from sim_core.checks import ConfigError, require
 
 
 class RunIdentity(NamedTuple):
@@ -23,8 +24,15 @@ class RunIdentity(NamedTuple):
     mlflow_run_id: str
 
 
+class Storage(NamedTuple):
+    """How the run's checkpoints are stored: URL or folder (None: in the run's folder), and how many best ones stay."""
+
+    checkpoint_url: str | None = None
+    keep_best: int = 0
+
+
 class RunFolder:
-    """Paths under one run's folder, and its two small files.
+    """Paths under one run's folder, and its small files.
 
     Args:
       path: the folder.
@@ -71,6 +79,33 @@ class RunFolder:
           ConfigError: the file is missing, no JSON, or holds another version's config.
         """
         return from_dict(_read(self.path / "config.json"))
+
+    def save_storage(self, storage: Storage) -> None:
+        """Writes `storage.json`."""
+        write_json(self.path / "storage.json", storage._asdict())
+
+    def storage(self) -> Storage:
+        """Reads `storage.json`; a run without one has its checkpoints in its folder.
+
+        Raises:
+          ConfigError: the file is damaged.
+        """
+        path = self.path / "storage.json"
+        if not path.exists():
+            return Storage()
+        try:
+            storage = Storage(**_read(path))
+        except TypeError as error:
+            raise ConfigError(f"{path} does not say where checkpoints are; name another run or train anew") from error
+        url, best = storage
+        require(url is None or isinstance(url, str), f"{path}: checkpoint_url must be a text, not {url!r}")
+        require(type(best) is int and best >= 0, f"{path}: keep_best must be a whole number from 0 on, not {best!r}")
+        return storage
+
+    def checkpoint_location(self) -> Location:
+        """Where the run's checkpoints lie (see `storage` for errors)."""
+        url = self.storage().checkpoint_url
+        return self.checkpoints if url is None else as_location(url)
 
     def save_identity(self, identity: RunIdentity) -> None:
         """Writes `run.json`."""

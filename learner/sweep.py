@@ -201,8 +201,8 @@ def make_baseline_cell(
     return Cell(f"{baseline}-{method}-{robots}r{groups}g-{cell_hash(config)}", config, baseline)
 
 
-def other_worlds(sweep: SweepConfig, cell: Cell) -> list[WorldConfig]:
-    """The other setups in which a cell's policy is evaluated (Extrapolation).
+def _other_setups(sweep: SweepConfig, cell: Cell) -> list[tuple[int, int]]:
+    """(robots, groups) of the other setups in which a cell's policy is evaluated (Extrapolation).
 
     M_sensor's state has the same size in all; that of M_IN and M_OUT has a row a group, so groups stay.
     """
@@ -210,14 +210,19 @@ def other_worlds(sweep: SweepConfig, cell: Cell) -> list[WorldConfig]:
     if sweep.extrapolation == "none" or cell.policy != LEARNED:
         return []
     groups = sweep.groups if world.method == "sensor" else (world.groups,)
-    setups = [(r, g) for r in sweep.robots for g in groups if (r, g) != (world.robots, world.groups)]
-    return [dataclasses.replace(world, robots=r, groups=g) for r, g in setups]
+    return [(r, g) for r in sweep.robots for g in groups if (r, g) != (world.robots, world.groups)]
+
+
+def other_worlds(sweep: SweepConfig, cell: Cell) -> list[WorldConfig]:
+    """The worlds of the other setups in which a cell's policy is evaluated (Extrapolation)."""
+    world = cell.config.world
+    return [dataclasses.replace(world, robots=r, groups=g) for r, g in _other_setups(sweep, cell)]
 
 
 def wanted(sweep: SweepConfig, cell: Cell) -> dict[tuple[int, int], int]:
     """Episodes that a cell's results must have, by (robots, groups) played in."""
     world, fixed = cell.config.world, cell.config.final_eval_episodes
-    others = {(w.robots, w.groups): sweep.extrapolation_episodes for w in other_worlds(sweep, cell)}
+    others = dict.fromkeys(_other_setups(sweep, cell), sweep.extrapolation_episodes)
     return {(world.robots, world.groups): fixed} | others
 
 

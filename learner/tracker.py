@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import math
 import os
@@ -12,7 +11,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -20,7 +18,8 @@ import torch
 
 from actors.network import QNetwork, WeightsSnapshot, load_snapshot
 from actors.vector_env import EnvShape
-from learner.config import RunConfig, config_hash
+from learner.addresses import hide_secrets, public_uri
+from learner.config import RunConfig, config_hash, flat_params
 from learner.journal import Row, charted
 from learner.views import TAG, packed_view, sweep_views
 from sim_core.checks import ConfigError
@@ -46,24 +45,17 @@ MAX_BATCH = 900
 CONNECT_TIMEOUT_S = 5.0
 
 
-def flat_params(config: RunConfig) -> dict[str, Any]:
-    """The whole config as flat names; the world's fields and the run's have no name in common."""
-    values = dataclasses.asdict(config)
-    world: dict[str, Any] = values.pop("world")
-    return values | world
-
-
 def check_reachable(uri: str) -> None:
     """Raises ConfigError unless a server answers where `uri` is an address; local stores pass."""
-    parts = urlsplit(uri)
-    if parts.scheme not in ("http", "https"):
-        return
-    port = parts.port or (443 if parts.scheme == "https" else 80)
     try:
+        parts = urlsplit(uri)
+        if parts.scheme not in ("http", "https"):
+            return
+        port = parts.port or (443 if parts.scheme == "https" else 80)
         socket.create_connection((parts.hostname or "", port), CONNECT_TIMEOUT_S).close()
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: no address at all
         raise ConfigError(
-            f"no MLflow server answers at {uri} ({error}); start one with `mlflow server`, "
+            f"no MLflow server answers at {public_uri(uri)} ({error}); start one with `mlflow server`, "
             "or leave --tracking-uri out to log to a local file"
         ) from error
 
@@ -88,16 +80,17 @@ class Tracker:
         self.run_id = ""
         self.started_ms = 0
         """When the run began."""
+        self._logged: set[tuple[str, int]] = set()
         try:
             self._client = mlflow.MlflowClient(uri)
             found = self._client.get_experiment_by_name(experiment)
             self._experiment_id = (
                 found.experiment_id if found else self._client.create_experiment(experiment, artifact_root)
             )
-        except (MlflowException, SQLAlchemyError, OSError) as error:
-            first_line = str(error).splitlines()[0]
+        except (MlflowException, SQLAlchemyError, OSError, ValueError, ImportError) as error:
+            first_line = hide_secrets((str(error).splitlines() or [type(error).__name__])[0], uri)
             raise ConfigError(
-                f"the MLflow store {uri} cannot be opened ({first_line}); name another --tracking-uri"
+                f"the MLflow store {public_uri(uri)} cannot be opened ({first_line}); name another --tracking-uri"
             ) from error
 
     @property
@@ -153,9 +146,14 @@ class Tracker:
             self._client.log_batch(run_id, tags=[RunTag("attempts", str(attempts + 1))])
         except MlflowException as error:
             raise ConfigError(
-                f"the MLflow store {self.uri} does not know run {run_id}; name the store it was logged to"
+                f"the MLflow store {public_uri(self.uri)} does not know run {run_id}; name the store it was logged to"
             ) from error
         self.run_id, self.started_ms = run_id, run.info.start_time
+
+    def skip_what_is_logged(self) -> None:
+        """Lets `push` leave out every metric at a step at which the run has it already."""
+        for key in self._client.get_run(self.run_id).data.metrics:
+            self._logged |= {(key, metric.step) for metric in self._client.get_metric_history(self.run_id, key)}
 
     def push(self, rows: list[Row]) -> None:
         """Mirrors journal rows without their accounts; a row that is there already is stored once."""
@@ -163,7 +161,7 @@ class Tracker:
             Metric(key, value, row.time_ms, row.env_steps)
             for row in rows
             for key, value in charted(row.metrics).items()
-            if math.isfinite(value)
+            if math.isfinite(value) and (key, row.env_steps) not in self._logged
         ]
         for start in range(0, len(metrics), MAX_BATCH):
             self._client.log_batch(self.run_id, metrics=metrics[start : start + MAX_BATCH])
@@ -230,5 +228,8 @@ def git_commit() -> str:
     if os.environ.get(COMMIT):
         return os.environ[COMMIT]
     here = Path(__file__).parent
-    done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False)
+    try:
+        done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False)
+    except OSError:  # no git
+        return "unknown"
     return done.stdout.strip() or "unknown"

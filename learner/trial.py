@@ -21,13 +21,14 @@ from actors.network import WeightsSnapshot
 from actors.result_table import LEARNED, ResultRow, read_table, write_table
 from actors.transitions import EpisodeStats
 from actors.vector_env import env_shape
-from learner.checkpoint import Checkpoint, CheckpointError
+from learner.addresses import public_uri
+from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.journal import Row
 from learner.place import Place
 from learner.policy_file import read_saved_policy, save_policy
 from learner.results import final_metrics, summarise
-from learner.run import RunResult, execute, resume_point
+from learner.run import RunResult, execute, last_checkpoint
 from learner.run_folder import RunFolder, RunIdentity
 from learner.sweep import Cell, SweepConfig, cell_hash, done_cells, other_worlds
 from learner.tracker import Tracker
@@ -98,7 +99,7 @@ def _start_or_find(cell: Cell, sweep: SweepConfig, folder: RunFolder, place: Swe
     else:
         tracker.start(cell.config, {"sweep": place.sweep} | _tags(cell, sweep))
     folder.save_config(cell.config)
-    folder.save_identity(RunIdentity(cell.name, tracker.uri, place.experiment, tracker.run_id))
+    folder.save_identity(RunIdentity(cell.name, public_uri(tracker.uri), place.experiment, tracker.run_id))
     return tracker
 
 
@@ -110,13 +111,6 @@ def _tags(cell: Cell, sweep: SweepConfig) -> dict[str, str]:
         "setup": cell.config.world.setup,
         "mlflow.runName": cell.name,
     }
-
-
-def _checkpoint(folder: RunFolder, config: RunConfig) -> Checkpoint | None:
-    try:
-        return resume_point(folder, config)[0]
-    except CheckpointError:
-        return None  # killed before its first one
 
 
 def run_cell(sweep: SweepConfig, cell: Cell, place: SweepPlace, on_row: Callable[[Row], None]) -> Path:
@@ -134,6 +128,7 @@ def run_cell(sweep: SweepConfig, cell: Cell, place: SweepPlace, on_row: Callable
     folder = RunFolder(place.cells / cell.key)
     if folder.results.is_file() and done_cells(sweep, [cell], read_table(folder.results)):
         return folder.results
+    checkpoint = last_checkpoint(folder, cell.config)
     tracker = _start_or_find(cell, sweep, folder, place)
     if cell.policy != LEARNED:
         with tracker.ending():
@@ -142,14 +137,23 @@ def run_cell(sweep: SweepConfig, cell: Cell, place: SweepPlace, on_row: Callable
         with tracker.ending():
             _play_again(sweep, cell, folder, tracker)
     else:
-        _train(sweep, cell, folder, tracker, on_row)  # ends its MLflow run itself
+        _train(sweep, cell, folder, tracker, checkpoint, on_row)  # ends its MLflow run itself
     _new_table(folder).rename(folder.results)  # once MLflow has all and its run is closed
     shutil.rmtree(folder.checkpoints, ignore_errors=True)  # the policy and the results stay
     return folder.results
 
 
-def _train(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker, on_row: Callable[[Row], None]) -> None:
-    """Trains from the newest checkpoint, and evaluates the policy."""
+def _train(
+    sweep: SweepConfig,
+    cell: Cell,
+    folder: RunFolder,
+    tracker: Tracker,
+    checkpoint: Checkpoint | None,
+    on_row: Callable[[Row], None],
+) -> None:
+    """Trains from a checkpoint or the start, and evaluates the policy."""
+    if checkpoint is None:
+        tracker.skip_what_is_logged()  # the same cell makes the same rows again, at another time
 
     def finish(result: RunResult, rows: list[Row]) -> None:
         assert result.weights is not None and result.episodes is not None
@@ -158,7 +162,7 @@ def _train(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker, 
         tracker.artifact(folder.policy)
         _log_table(results, folder, tracker)
 
-    execute(folder, cell.config, tracker, RowDisplay(on_row), _checkpoint(folder, cell.config), Place(), finish)
+    execute(folder, cell.config, tracker, RowDisplay(on_row), checkpoint, Place(), finish)
 
 
 def _fixed_seeds(cell: Cell) -> list[int]:

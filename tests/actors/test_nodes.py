@@ -1,5 +1,7 @@
 """Rollout nodes and shard nodes: pushes, replies, reports and state."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,16 @@ from actors.vector_env import env_shape
 
 NUM_ENVS, STEPS = 2, 8
 BLOCK = NUM_ENVS * STEPS
+
+
+def saved(node, location):
+    """Has a node save itself and waits for the end; its state."""
+    state, deadline_s = node.save(location), time.monotonic() + 60
+    while (written := node.saved()) is None:
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+    assert written.error is None and written.files
+    return state
 
 
 class Later:
@@ -147,7 +159,7 @@ def test_a_saved_node_goes_on_where_it_was(tmp_path, make_node, make_shard):
     shards = [make_shard(), make_shard()]
     node = make_node(shards)
     node.collect(0.5)
-    state = node.save(tmp_path / "worker.safetensors")
+    state = saved(node, tmp_path / "worker.safetensors")
     expected = [node.collect(0.5)[0] for _ in range(2)]
     again = [make_shard(), make_shard()]
     resumed = make_node(again)
@@ -166,12 +178,12 @@ def test_nothing_is_saved_while_pushes_are_under_way(tmp_path, make_node, make_s
     with pytest.raises(RuntimeError, match="settle"):
         node.save(tmp_path / "worker.safetensors")
     node.settle()
-    node.save(tmp_path / "worker.safetensors")
+    saved(node, tmp_path / "worker.safetensors")
 
 
 def test_damaged_files_are_refused(tmp_path, make_node, make_shard):
     node, path = make_node([make_shard()]), tmp_path / "worker.safetensors"
-    state = node.save(path)
+    state = saved(node, path)
     path.write_bytes(path.read_bytes()[:-9])
     for damaged in (path, tmp_path / "missing.safetensors"):
         with pytest.raises(ValueError, match="cannot be read"):

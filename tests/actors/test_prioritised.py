@@ -153,7 +153,8 @@ def filled(tmp_path, inserted=(21, 3)):
     shard.set_priorities(shard.sample(9).draws.number, np.linspace(-4, 9, 9, dtype=np.float32))
     shard.add(make_block(range(first, first + second), sequence=4, worker_id=2))
     shard.set_priorities(np.array([0, first]), np.array([1.5, 3.5], np.float32))
-    return shard, json.loads(json.dumps(shard.save(tmp_path / "shard.zarr")))
+    shard.snapshot().save(tmp_path / "shard.zarr")
+    return shard, json.loads(json.dumps(shard.get_state()))
 
 
 @pytest.mark.parametrize("inserted", [(21, 3), (5, 2), (9, 7)])
@@ -177,6 +178,19 @@ def test_a_saved_shard_goes_on_bit_by_bit(tmp_path, inserted):
     np.testing.assert_array_equal(shard.priorities, resumed.priorities)
 
 
+def test_what_comes_after_the_snapshot_is_not_in_it(tmp_path):
+    shard, state = filled(tmp_path)
+    snapshot, before = shard.snapshot(), shard.priorities.copy()
+    shard.add(make_block(range(300, 309), sequence=5, worker_id=2))
+    shard.set_priorities(shard.sample(16).draws.number, np.linspace(0.1, 90, 16, dtype=np.float32))
+    snapshot.save(tmp_path / "later.zarr")
+    resumed, expected = make_shard(16), make_shard(16)
+    resumed.load(tmp_path / "later.zarr", state)
+    expected.load(tmp_path / "shard.zarr", state)
+    np.testing.assert_array_equal(resumed.priorities, before)
+    np.testing.assert_array_equal(resumed.sample(50).rows, expected.sample(50).rows)
+
+
 def test_a_save_that_does_not_fit_is_refused(tmp_path):
     _, state = filled(tmp_path)
     with pytest.raises(ValueError, match="another capacity than 17"):
@@ -189,6 +203,8 @@ def test_a_save_that_does_not_fit_is_refused(tmp_path):
 
 
 def test_a_save_without_priorities_is_refused(tmp_path):
-    state = ReplayShard(DTYPE, 16, 0).save(tmp_path / "shard.zarr")
+    shard = ReplayShard(DTYPE, 16, 0)
+    shard.snapshot().save(tmp_path / "shard.zarr")
+    state = shard.get_state()
     with pytest.raises(ValueError, match="without priorities"):
         make_shard(16).load(tmp_path / "shard.zarr", state)

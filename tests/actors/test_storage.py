@@ -111,3 +111,32 @@ def test_what_is_no_replay_is_refused(tmp_path):
     zarr.open_group(str(tmp_path / "other.zarr"), mode="w")
     with pytest.raises(ValueError, match="format"):
         load_rows(tmp_path / "other.zarr", DTYPE)
+
+
+def test_a_store_of_zarr_format_2_is_refused_whatever_it_holds(tmp_path):
+    """Among the codecs of format 2 is pickle."""
+    root = zarr.open_group(str(tmp_path / "old.zarr"), mode="w", zarr_format=2)
+    root.attrs.update({"format": storage.FORMAT, "rows": 0, "crc32": {}})
+    with pytest.raises(ValueError, match="missing or incomplete"):
+        load_rows(tmp_path / "old.zarr", DTYPE)
+
+
+@pytest.mark.parametrize("rows", [10**15, -1, "50", 50.0, None, [50]])
+def test_rows_that_cannot_be_are_refused_before_memory_is_taken(saved, rows):
+    zarr.open_group(str(saved), mode="r+").attrs["rows"] = rows
+    with pytest.raises(ValueError, match="claims"):
+        load_rows(saved, DTYPE)
+
+
+def test_more_rows_than_fit_are_refused(saved):
+    load_rows(saved, DTYPE, at_most=50)
+    with pytest.raises(ValueError, match="claims 50 rows; at most 49"):
+        load_rows(saved, DTYPE, at_most=49)
+
+
+def test_columns_that_claim_more_than_they_hold_are_refused(tmp_path):
+    root = zarr.open_group(str(tmp_path / "huge.zarr"), mode="w", zarr_format=3)
+    root.create_array("reward", shape=(10**14,), dtype="f4", chunks=(10**9,))
+    root.attrs.update({"format": storage.FORMAT, "rows": 5, "crc32": {"reward": 0}})
+    with pytest.raises(ValueError, match=r"reward.*not float32\(5,\)"):
+        load_rows(tmp_path / "huge.zarr", np.dtype([("reward", "f4")]))

@@ -11,7 +11,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 from tests.benchmarks import simulator  # noqa: E402
 
-BENCHMARKS = ("simulator", "replay", "learner", "service", "export")
+BENCHMARKS = ("simulator", "replay", "learner", "service", "export", "checkpoints")
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:

@@ -71,6 +71,9 @@ class Silent:
     def checkpoint(self, folder, journal_offset) -> None:
         pass
 
+    def checkpoint_failed(self, env_steps, reason) -> None:
+        raise RuntimeError(reason)
+
 
 def service_rates(config: RunConfig) -> tuple[float, float]:
     """(env steps/s, updates/s) of the whole service in its steady state."""

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from actors.parts import file_sum
 from deploy.cli import main, parse
+from learner.manifest import decode_manifest, encode_manifest
 from learner.presets import preset_config
 from learner.run_folder import RunFolder
 from tests.integration.conftest import SMALL, flags
@@ -191,7 +193,7 @@ class TestWithARun:
             path.write_bytes(data)
         code, error = run(capsys, "evaluate", "r", "--runs-dir", str(runs))
         assert code == 2
-        assert "damaged (learner.safetensors)" in error
+        assert "damaged (learner.safetensors: its content has another checksum)" in error
 
     def test_one_damaged_checkpoint_is_skipped_and_said(self, capsys, runs):
         newest = max((runs / "r" / "checkpoints").iterdir())
@@ -206,6 +208,29 @@ class TestWithARun:
         code, error = run(capsys, "resume", "r", "--runs-dir", str(runs), "--total-env-steps", "9000")
         assert code == 2
         assert "another config" in error
+
+    @pytest.mark.parametrize(
+        ("part", "value"),
+        [
+            ("pacing", {"inserted": "many"}),
+            ("due", {}),
+            ("workers", []),
+            ("workers", [{}]),
+            ("meters", {"sums": 5}),
+            ("learner", {"shards": [{}], "rng": {}, "sizes": []}),
+            ("learner", {"shards": [], "rng": None, "sizes": [1]}),
+        ],
+    )
+    def test_a_state_that_means_harm_is_refused_though_its_checksums_are_right(self, capsys, runs, part, value):
+        for folder in (runs / "r" / "checkpoints").iterdir():
+            state = json.loads((folder / "state.json").read_text())
+            (folder / "state.json").write_text(json.dumps(state | {part: value}))
+            manifest = decode_manifest((folder / "manifest.json").read_bytes(), folder)
+            files = {**manifest.files, "state.json": file_sum(folder / "state.json")}
+            (folder / "manifest.json").write_bytes(encode_manifest(manifest.env_steps, files))
+        code, error = run(capsys, "resume", "r", "--runs-dir", str(runs), "--total-env-steps", "9000")
+        assert code == 2 and "does not fit this run" in error
+        assert "Traceback" not in error and error.count("\n") == 1
 
     def test_a_policy_of_another_shape_is_refused(self, capsys, runs):
         path = runs / "r" / "config.json"

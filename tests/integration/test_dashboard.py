@@ -21,7 +21,7 @@ from deploy.cli import main
 from deploy.dashboard import report_server
 from deploy.dashboard_source import find_source
 from deploy.live import live_server
-from deploy.policies import newest_policy
+from deploy.policies import find_policy
 from learner.checkpoint import newest_valid
 from learner.cluster import process_cluster
 from learner.journal import Journal, read_rows
@@ -137,7 +137,7 @@ def test_a_played_episode_is_the_policys(browser, sweep, tmp_path):
     shown, seed = browser.execute_script("return [episodes.shown, Number(data.setup.split(' ').pop())]")
     cell = RunFolder(sweep / "cells" / shown.split("/")[0])
     config = cell.config()
-    episode = record_episode(config.env, newest_policy(cell, config), seed)
+    episode = record_episode(config.env, find_policy(cell, config), seed)
     step = len(episode.position) // 2
     seen = browser.execute_script("return Array.from(positions)")
     np.testing.assert_allclose(np.reshape(seen, episode.position.shape)[step], episode.position[step], atol=0.001)

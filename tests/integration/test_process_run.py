@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import signal
 from contextlib import closing
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from learner.cluster import process_cluster
 from learner.journal import Journal
 from learner.loop import TrainingLoop
 from tests.integration.conftest import flags
+from tests.integration.jobs import Job
 
 CLOCKED = ("speed/", "system/", "policy/staleness_s")
 """Metrics that depend on the clock."""
@@ -36,6 +38,9 @@ class Silent:
 
     def checkpoint(self, folder, journal_offset):
         pass
+
+    def checkpoint_failed(self, env_steps, reason):
+        raise AssertionError(reason)
 
 
 class Listing(Silent):
@@ -150,3 +155,22 @@ def test_a_run_resumed_in_a_new_process_is_the_uninterrupted_one(small, shoal, t
     halves = final_state(tmp_path / "runs" / "halves")
     assert halves[1]["env_steps"] >= 2 * 3_000
     assert_same(final_state(tmp_path / "whole"), halves)
+
+
+def test_sigterm_saves_and_the_run_goes_on(small, shoal, tmp_path):
+    long = dataclasses.replace(small, total_env_steps=10_000_000, final_eval_episodes=2)
+    job = Job(tmp_path, "train", "--name", "r", *flags(long))
+    try:
+        job.wait_for_checkpoints("r", 1)
+        job.process.terminate()
+        assert job.process.wait(120) == 128 + signal.SIGTERM, job.log.read_text()
+    finally:
+        job.process.kill()
+    output = job.log.read_text()
+    assert "stopped by SIGTERM" in output and "checkpoint saved" in output and "Traceback" not in output
+    said = int(output.split("stopped by SIGTERM at ")[1].split()[0].replace(",", ""))
+    saved, skipped = newest_valid(tmp_path / "runs/r/checkpoints")
+    assert saved.state["env_steps"] == said and not skipped, "the checkpoint is of the moment of the stop"
+    done = shoal("resume", "r", "--total-env-steps", str(said + 2_000))
+    assert done.returncode == 0, done.stderr
+    assert str(saved.folder) in done.stdout

@@ -13,8 +13,7 @@ import zarr
 from safetensors.numpy import load_file
 
 from learner.checkpoint import newest_valid
-from learner.config import to_dict
-from learner.tracker import flat_params
+from learner.config import flat_params, to_dict
 from tests.integration.conftest import SMALL, flags
 from tests.integration.jobs import Job
 

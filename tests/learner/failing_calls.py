@@ -1,5 +1,6 @@
 """Calls within one process that behave like those between processes, with faults where the test wants them."""
 
+import threading
 from collections import defaultdict, deque
 
 import numpy as np
@@ -18,6 +19,8 @@ class Later:
 class FailingCalls(LocalCalls):
     """Runs each node's calls in the order of their start, at the moment when somebody asks for a result.
 
+    Threads take turns.
+
     Args:
       fault: is called with (node, method) before each call of a node; says what goes wrong, or None:
         "dies before", "dies after", "unreachable before", "unreachable after". After a death every call fails.
@@ -30,14 +33,18 @@ class FailingCalls(LocalCalls):
         self.faults = 0
         self._queues = defaultdict(deque)
         self._rng = np.random.default_rng(seed)
+        self._turn = threading.RLock()
 
     def start(self, node, method, *args):
         later = Later(node, method, [arg.value if isinstance(arg, Done) else arg for arg in args])
-        self._queues[id(node)].append(later)
+        with self._turn:
+            self._queues[id(node)].append(later)
         return later
 
     def wait(self, refs, timeout_s):
         """Some of `refs`, at least one; none before an earlier one of its node."""
+        if len(refs) == 1:
+            return list(refs)
         held_back, ready = set(), []
         for ref in refs:
             node = id(ref.call[0]) if isinstance(ref, Later) else None
@@ -50,9 +57,9 @@ class FailingCalls(LocalCalls):
     def get(self, ref):
         if isinstance(ref, Done):
             return ref.value
-        queue = self._queues[id(ref.call[0])]
-        while not ref.ran:
-            self._run(queue.popleft())
+        with self._turn:
+            while not ref.ran:
+                self._run(self._queues[id(ref.call[0])].popleft())
         if ref.error is not None:
             raise ref.error
         return ref.result

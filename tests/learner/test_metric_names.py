@@ -25,6 +25,9 @@ class Silent:
     def checkpoint(self, folder, journal_offset):
         pass
 
+    def checkpoint_failed(self, env_steps, reason):
+        raise AssertionError(reason)
+
 
 def journal_names(config: RunConfig, folder: Path) -> set[str]:
     """Names of all metrics that a run in one process leaves in its journal."""

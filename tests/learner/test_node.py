@@ -1,6 +1,7 @@
 """The learner's node: sampling over shards, publication, state; and one contract for both placements of a shard."""
 
 import json
+import time
 
 import numpy as np
 import pytest
@@ -22,6 +23,16 @@ RATE = 1e-3
 def make_block(rows, sequence=0, worker_id=0, incarnation=0, version=0, schema=SCHEMA_VERSION):
     header = BlockHeader(schema, worker_id, incarnation, sequence, version, 0.0, 0.0, len(rows))
     return TransitionBlock(header, rows, join_stats([]))
+
+
+def saved(node, location):
+    """Has a node save itself and waits for the end; its state."""
+    state, deadline_s = node.save(location), time.monotonic() + 60
+    while (written := node.saved()) is None:
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+    assert written.error is None and written.files
+    return state
 
 
 @pytest.fixture
@@ -175,7 +186,7 @@ def test_a_saved_node_goes_on_bit_by_bit(tmp_path, make_learner, make_rows, num_
     for sequence in range(6):
         learner.add(make_block(make_rows(30, seed=sequence), sequence))
     learner.update(4, RATE, 0.5)
-    state = json.loads(json.dumps(learner.save(tmp_path)))
+    state = json.loads(json.dumps(saved(learner, tmp_path)))
     expected = [learner.update(4, RATE, 0.5) for _ in range(2)]
     resumed, again = make_learner(num_shards, priorities=priorities, seed=99)
     weights = resumed.load(tmp_path, state)
@@ -193,7 +204,7 @@ def test_a_loaded_node_publishes_its_weights(tmp_path, make_learner, make_rows):
     learner, (shard,) = make_learner()
     shard.add(make_block(make_rows(30)))
     learner.update(4, RATE)
-    state = learner.save(tmp_path)
+    state = saved(learner, tmp_path)
     resumed, (again,) = make_learner()
     weights = resumed.load(tmp_path, state)
     assert weights == resumed.weights() and weights[0].value.version == 4
@@ -202,7 +213,7 @@ def test_a_loaded_node_publishes_its_weights(tmp_path, make_learner, make_rows):
 
 def test_another_number_of_shards_is_refused(tmp_path, make_learner, make_rows):
     learner, _ = make_learner(2)
-    state = learner.save(tmp_path)
+    state = saved(learner, tmp_path)
     with pytest.raises(ValueError, match="2 shards, this run 3"):
         make_learner(3)[0].load(tmp_path, state)
 
@@ -210,7 +221,7 @@ def test_another_number_of_shards_is_refused(tmp_path, make_learner, make_rows):
 @pytest.mark.parametrize("content", [None, b"damaged"])
 def test_a_damaged_file_is_refused(tmp_path, make_learner, content):
     learner, _ = make_learner()
-    state = learner.save(tmp_path)
+    state = saved(learner, tmp_path)
     (tmp_path / "learner.safetensors").unlink()
     if content is not None:
         (tmp_path / "learner.safetensors").write_bytes(content)

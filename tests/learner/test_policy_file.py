@@ -1,28 +1,32 @@
 """Reading a policy from a checkpoint."""
 
 import dataclasses
+import time
 
 import numpy as np
 import pytest
 
 from actors.vector_env import env_shape
-from learner.checkpoint import CheckpointError, read_checkpoint, write_checkpoint
+from learner.checkpoint import Checkpoint
 from learner.cluster import process_cluster
 from learner.config import RunConfig
+from learner.manifest import CheckpointError
 from learner.policy_file import read_policy, read_saved_policy, save_policy
 from sim_core.config import WorldConfig
+
+
+def checkpoint_of(learner, folder):
+    learner.save(folder)
+    while learner.saved() is None:
+        time.sleep(0.005)
+    return Checkpoint(folder, {"updates": 42})
 
 
 @pytest.fixture
 def saved(tmp_path, small_run):
     """A checkpoint of a learner, and the weights that it published."""
     learner = process_cluster(small_run, 0).learner
-
-    def save(folder):
-        return {"learner": learner.save(folder), "updates": 42}
-
-    checkpoint = read_checkpoint(write_checkpoint(tmp_path, 7, save))
-    return checkpoint, learner.weights()[0].value
+    return checkpoint_of(learner, tmp_path), learner.weights()[0].value
 
 
 def test_a_dueling_policy_is_kept_as_the_plain_network_that_it_equals(tmp_path, small_run):
@@ -31,8 +35,8 @@ def test_a_dueling_policy_is_kept_as_the_plain_network_that_it_equals(tmp_path, 
     weights = learner.weights()[0].value
     save_policy(tmp_path / "policy.safetensors", weights, config, shape)
     again = read_saved_policy(tmp_path / "policy.safetensors", config, shape)
-    checkpoint = write_checkpoint(tmp_path, 7, lambda folder: {"learner": learner.save(folder), "updates": 42})
-    kept = read_policy(read_checkpoint(checkpoint), config, shape)
+    checkpoint = checkpoint_of(learner, tmp_path)
+    kept = read_policy(checkpoint, config, shape)
     assert (kept.version, again.version) == (42, 0)
     assert [len(bias) for bias in weights.arrays[1::2]] == [9, 16, shape.num_actions]
     for copy in (again, kept):
@@ -40,7 +44,7 @@ def test_a_dueling_policy_is_kept_as_the_plain_network_that_it_equals(tmp_path, 
             np.testing.assert_array_equal(array, expected)
     for other in (dataclasses.replace(config, network="plain"), dataclasses.replace(config, hidden_sizes=(9, 16))):
         with pytest.raises(CheckpointError, match="hidden_sizes, network"):
-            read_policy(read_checkpoint(checkpoint), other, shape)
+            read_policy(checkpoint, other, shape)
 
 
 def test_the_policy_is_the_published_one(saved, small_run):

@@ -12,10 +12,10 @@ import torch
 from actors.network import Policy
 from actors.vector_env import env_shape
 from learner.cluster import learner_settings as settings_of
-from learner.config import RunConfig, config_hash
+from learner.config import RunConfig, config_hash, flat_params
 from learner.journal import Row
 from learner.learner import Learner
-from learner.tracker import Tracker, check_reachable, flat_params
+from learner.tracker import Tracker, check_reachable, git_commit
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 
@@ -185,3 +185,40 @@ def test_a_store_that_cannot_be_opened_is_refused(uri, tmp_path, monkeypatch):
     (tmp_path / "a-file").write_text("no database")
     with pytest.raises(ConfigError, match="--tracking-uri"):
         Tracker(uri.format(tmp_path), "tests", None)
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "http://[",
+        "http://host:99999999",
+        "http://me:s3cret@127.0.0.1:1",
+        "https://s3cret@127.0.0.1:1",
+        "postgresql://me:s3cret@127.0.0.1:1/x",
+        "mysql+pymysql://me:s3cret@127.0.0.1:1/x",
+        "nosuch://me:s3cret@x",
+        "sqlite:////proc/nothing/x.db",
+        "$(touch touched);`touch touched`",
+    ],
+)
+def test_a_store_that_cannot_be_is_refused_without_its_password(uri, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError) as caught:
+        Tracker(uri, "tests", None)
+    shown = str(caught.value) + "".join(capfd.readouterr())
+    assert "s3cret" not in shown and "\n" not in str(caught.value)
+    assert not (tmp_path / "touched").exists()
+
+
+def test_no_secret_of_the_environment_reaches_a_run(store, small_run, monkeypatch):
+    for name in ("AWS_SECRET_ACCESS_KEY", "MLFLOW_TRACKING_PASSWORD", "MLFLOW_TRACKING_TOKEN", "RAY_AUTH_TOKEN"):
+        monkeypatch.setenv(name, "s3cret-value")
+    tracker = Tracker(store[0], "tests", store[1])
+    tracker.start(small_run, {"cell": "secrets"})
+    data = run_of(tracker).data
+    assert "s3cret-value" not in f"{data.params} {data.tags} {data.metrics}"
+
+
+def test_a_checkout_without_git_has_an_unknown_commit(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    assert git_commit() == "unknown"

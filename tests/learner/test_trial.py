@@ -12,6 +12,7 @@ from actors.evaluation_store import load_evaluation
 from actors.evaluator import evaluate
 from actors.result_table import read_table
 from actors.vector_env import env_shape
+from learner.manifest import CheckpointError
 from learner.policy_file import read_saved_policy
 from learner.run_folder import RunFolder
 from learner.sweep import Cell, SweepConfig, cell_hash
@@ -173,6 +174,49 @@ def test_a_crashed_cell_ends_as_if_nothing_had_happened(store, cell, tmp_path, c
     assert len(runs) == 1 and runs[0].info.status == "FINISHED"
     history = client.get_metric_history(runs[0].info.run_id, "eval/success_rate")
     assert len({metric.step for metric in history}) == len(history) >= 3
+
+
+def history_of(store, cell, key):
+    client, runs = runs_of(store, cell)
+    assert len(runs) == 1 and runs[0].info.status == "FINISHED"
+    return [metric.step for metric in client.get_metric_history(runs[0].info.run_id, key)]
+
+
+def test_a_cell_of_which_every_checkpoint_is_damaged_begins_anew_and_logs_nothing_twice(
+    store, cell, tmp_path, monkeypatch
+):
+    cell = cell._replace(key=f"{cell.key}-damaged")
+    place = SweepPlace(tmp_path, store, "cells")
+
+    def crash(*args):
+        raise Crash
+
+    monkeypatch.setattr("learner.trial.save_policy", crash)  # when MLflow has all of the training
+    with pytest.raises(Crash):
+        run_cell(SWEEP, cell, place, id)
+    monkeypatch.undo()
+    logged = mlflow.MlflowClient(store).get_metric_history(runs_of(store, cell)[1][0].info.run_id, "train/loss")
+    assert logged, "rows had reached MLflow before the crash"
+    checkpoints = list((tmp_path / cell.key / "checkpoints").glob("step-*/state.json"))
+    assert checkpoints
+    for state in checkpoints:
+        state.write_text("{}")
+    run_cell(SWEEP, cell, place, id)
+    for key, count in (("train/loss", 3), ("eval/success_rate", 3), ("final/success_rate", 1)):
+        steps = history_of(store, cell, key)
+        assert len(steps) == len(set(steps)) >= count
+
+
+def test_a_checkpoint_of_another_config_is_no_reason_to_begin_anew(store, cell, tmp_path):
+    cell = cell._replace(key=f"{cell.key}-other")
+    place = SweepPlace(tmp_path, store, "cells")
+    with pytest.raises(Crash):
+        run_cell(SWEEP, cell, place, crashing_at(2_600))
+    kept = sorted((tmp_path / cell.key / "checkpoints").iterdir())
+    other = cell._replace(config=dataclasses.replace(cell.config, learning_rate=0.5))
+    with pytest.raises(CheckpointError, match="learning_rate is 0.5 instead of 0.001"):
+        run_cell(SWEEP, other._replace(key=cell.key), place, id)
+    assert sorted((tmp_path / cell.key / "checkpoints").iterdir()) == kept
 
 
 def test_a_cell_whose_folder_is_gone_keeps_its_mlflow_run(store, cell, tmp_path):

@@ -7,9 +7,9 @@ import zlib
 import mlflow
 import pytest
 
-from learner.config import RunConfig
+from learner.config import RunConfig, flat_params
 from learner.results import outcome_label
-from learner.tracker import Tracker, flat_params
+from learner.tracker import Tracker
 from learner.views import TAG, packed_view, sweep_views
 from sim_core.outcomes import ENDED
 

@@ -1,0 +1,146 @@
+"""How long training stands still for a checkpoint: the snapshot of a full shard, and the whole service over Ray."""
+
+import tempfile
+import time
+from contextlib import closing
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from actors.nodes import ShardNode, ShardSettings
+from actors.rollout import join_stats
+from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
+from learner.config import RunConfig
+from learner.journal import Journal
+from learner.loop import TrainingLoop
+from learner.ray_edge import ray_cluster
+from tests.benchmarks.timing import spread
+
+BLOCK = 2_048
+ROUNDS = 5
+CHECKPOINTS = 6
+TARGET_MS = 100.0
+
+
+def milliseconds(work) -> float:
+    start_s = time.perf_counter()
+    work()
+    return 1000 * (time.perf_counter() - start_s)
+
+
+class FilledShard:
+    """A full shard of float32 observations, its inserts and its samples."""
+
+    def __init__(self, size: int, capacity: int) -> None:
+        self.dtype = transition_dtype(gym.spaces.Box(-1, 1, (size,), np.float32))
+        self.node = ShardNode(ShardSettings(self.dtype, capacity, 0))
+        self._rows = np.zeros(BLOCK, self.dtype)
+        self._rows["observation"] = np.random.default_rng(0).normal(size=(BLOCK, size))
+        self._sequence = 0
+        while self.node.size() < capacity:
+            self.add()
+
+    def add(self) -> None:
+        header = BlockHeader(SCHEMA_VERSION, 0, 0, self._sequence, 0, 0.0, 0.0, BLOCK)
+        self._sequence += 1
+        self.node.add(TransitionBlock(header, self._rows, join_stats([])))
+
+    def step(self) -> None:
+        """What a shard does between two checkpoints."""
+        self.add()
+        self.node.sample(4 * BLOCK)
+
+
+def shard_row(size: int, capacity: int) -> list[str]:
+    """One line of the first table: the snapshot, and the steps of the shard with and without a write under way."""
+    shard = FilledShard(size, capacity)
+    snapshots, quiet, writing, seconds = [], [], [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for i in range(ROUNDS):
+            quiet += [milliseconds(shard.step) for _ in range(50)]
+            start_s = time.perf_counter()
+            snapshots.append(milliseconds(lambda i=i: shard.node.save(Path(folder) / f"{i}.zarr")))
+            while (written := shard.node.saved()) is None:
+                writing.append(milliseconds(shard.step))
+            seconds.append(time.perf_counter() - start_s)
+            assert written.error is None, written.error
+    megabytes = capacity * shard.dtype.itemsize / 1e6
+    return [
+        f"{capacity:,} × {shard.dtype.itemsize} B = {megabytes:,.0f} MB",
+        spread(snapshots).text(2),
+        f"{np.median(quiet):.1f}, at most {max(quiet):.1f}",
+        f"{np.median(writing):.1f}, at most {max(writing):.1f}",
+        spread(seconds).text(2),
+    ]
+
+
+class Told:
+    """Counts the checkpoints that were written."""
+
+    def __init__(self) -> None:
+        self.written = 0
+
+    def row(self, row) -> None:
+        pass
+
+    def checkpoint(self, folder, journal_offset) -> None:
+        self.written += 1
+
+    def checkpoint_failed(self, env_steps, reason) -> None:
+        raise RuntimeError(reason)
+
+
+def service_rows(config: RunConfig) -> list[tuple[str, list[float]]]:
+    """Milliseconds that the loop stood still for each checkpoint, and gaps between updates with and without one."""
+    cluster, told = ray_cluster(config, 0, None), Told()
+    stalls, quiet, writing = [], [], []
+    last = (0.0, 0)
+    try:
+        with tempfile.TemporaryDirectory() as folder, closing(Journal(Path(folder) / "m.jsonl", 0)) as journal:
+
+            def stop() -> bool:
+                nonlocal last
+                now_s = time.perf_counter()
+                if loop.updates > last[1]:
+                    if last[1]:
+                        (writing if loop._checkpointer.is_busy else quiet).append(1000 * (now_s - last[0]))
+                    last = (now_s, loop.updates)
+                return told.written >= CHECKPOINTS
+
+            loop = TrainingLoop(config, cluster, journal, Path(folder) / "checkpoints", told, stop)
+            begin = loop.checkpoint
+            loop.checkpoint = lambda: stalls.append(milliseconds(begin))
+            loop.run()
+    finally:
+        cluster.close()
+    return [
+        ("the loop settles and snapshots", stalls),
+        ("between two calls of updates, no checkpoint", quiet),
+        ("between two calls of updates, one being written", writing),
+    ]
+
+
+def main() -> None:
+    table = Table(title=f"a shard's milliseconds, median (lowest … highest) of {ROUNDS}; target: < {TARGET_MS:.0f}")
+    for column in ("full shard", "snapshot", "insert + sample", "the same, while it is written", "seconds to write"):
+        table.add_column(column, justify="right")
+    for size, capacity in ((16, 500_000), (72, 500_000), (72, 1_000_000)):
+        table.add_row(*shard_row(size, capacity))
+    console = Console(width=150)
+    console.print(table)
+    config = RunConfig(
+        total_env_steps=10**9, eval_every_env_steps=10**9, checkpoint_every_env_steps=150_000, replay_capacity=400_000
+    )
+    table = Table(title=f"the service over Ray, {config.world.setup} M_sensor, {CHECKPOINTS} checkpoints; milliseconds")
+    for column in ("what", "median", "highest"):
+        table.add_column(column, justify="right")
+    for what, values in service_rows(config):
+        table.add_row(what, f"{np.median(values):.0f}", f"{max(values):.0f}")
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,52 @@
+"""What no machine can hold is refused at the start; what a run takes is estimated from what it makes."""
+
+import dataclasses
+
+import numpy as np
+import psutil
+import pytest
+
+from actors.vector_env import env_shape
+from learner.cluster import process_cluster
+from learner.config import RunConfig
+from learner.footprint import check_fits, parts_bytes
+from sim_core.checks import ConfigError
+from sim_core.config import WorldConfig
+
+MANY_WORLDS = {"envs_per_worker": 10**6, "steps_per_block": 1, "replay_capacity": 10**6}
+
+
+def test_the_defaults_fit():
+    assert check_fits(RunConfig()) == env_shape(RunConfig().env)
+
+
+@pytest.mark.parametrize(
+    ("changes", "part"),
+    [
+        ({"replay_capacity": 10**12}, "replay_capacity"),
+        ({"hidden_sizes": (10**6, 10**6)}, "hidden_sizes"),
+        ({"hidden_sizes": (10**30,)}, "hidden_sizes"),
+        ({"workers": 10**5}, "workers and replay_shards"),
+        ({"batch_size": 10**9}, "batch_size and updates_per_call"),
+        ({"n_step": 10**12}, "envs_per_worker, steps_per_block and n_step"),
+        ({"eval_episodes": 10**15}, "eval_episodes and final_eval_episodes"),
+        (
+            {"world": WorldConfig(robots=1_000, arena_radius_m=100.0), **MANY_WORLDS},
+            "workers, envs_per_worker and robots",
+        ),
+    ],
+)
+def test_what_no_machine_holds_is_refused_by_its_setting(changes, part):
+    with pytest.raises(ConfigError, match=f"of it by {part}, and this machine has"):
+        check_fits(dataclasses.replace(RunConfig(), **changes))
+
+
+def test_the_estimates_are_those_of_what_is_made(small_run):
+    shape = env_shape(small_run.env)
+    parts = parts_bytes(small_run, shape)
+    learner = process_cluster(small_run, 0).learner
+    assert parts["replay_capacity"] == learner._shards[0].shard._rows.nbytes
+    online = sum(tensor.numel() for tensor in learner._learner.online.state_dict().values())
+    assert parts["hidden_sizes"] == online * 4 * 5
+    assert sum(parts.values()) < psutil.virtual_memory().total
+    assert all(np.isfinite(value) and value >= 0 for value in parts.values())
