@@ -17,20 +17,8 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import tyro  # noqa: E402
 
 from actors.faults import RunFailed  # noqa: E402
-from deploy.options import (  # noqa: E402
-    Chaos,
-    Command,
-    Dashboard,
-    Evaluate,
-    Export,
-    Report,
-    Resume,
-    Submit,
-    Sweep,
-    Train,
-    Watch,
-    ray_address,
-)
+from deploy.options import Chaos, Resume, Submit, Sweep, Train, ray_address  # noqa: E402
+from deploy.result_options import Dashboard, Evaluate, Export, Report, Watch  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
 from learner.presets import PresetName, preset_config  # noqa: E402
 from learner.ray_auth import set_auth_mode  # noqa: E402
@@ -40,6 +28,7 @@ from sim_core.config import MethodName  # noqa: E402
 FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
+Command = Train | Sweep | Report | Resume | Evaluate | Watch | Dashboard | Chaos | Export | Submit
 JOBS = ("train", "sweep")
 """What `shoal submit` runs."""
 BAD_NAMES = (errno.ENAMETOOLONG, errno.EILSEQ, errno.ELOOP)

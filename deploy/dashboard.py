@@ -16,7 +16,7 @@ from deploy.live import episode_number, serve_until_interrupted
 from deploy.shelves import samples
 
 if TYPE_CHECKING:
-    from deploy.options import Dashboard
+    from deploy.result_options import Dashboard
 
 MEGABYTE = 1_000_000
 FILE_NAME = "dashboard.html"

@@ -12,8 +12,8 @@ from torch import nn
 from actors.network import QNetwork, WeightsSnapshot, load_snapshot
 from actors.vector_env import env_shape
 from deploy.folders import make_folder
-from deploy.options import Export
 from deploy.policies import find_policy
+from deploy.result_options import Export
 from learner.checkpoint import read_checkpoint
 from learner.checkpoint_store import FolderStore
 from learner.config import RunConfig, config_hash, to_dict

@@ -18,7 +18,7 @@ from learner.run_folder import RunFolder
 from sim_core.checks import ConfigError, require
 
 if TYPE_CHECKING:
-    from deploy.options import Watch
+    from deploy.result_options import Watch
 
 
 class LiveRun:

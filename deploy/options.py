@@ -1,23 +1,19 @@
-"""The command line's arguments, one dataclass a command; tyro makes flags and help of them."""
+"""The command line's arguments for what trains, one dataclass a command; tyro makes flags and help of them."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from tyro.conf import Positional, Suppress, UseCounterAction, arg
+from tyro.conf import Positional, Suppress
 
 from learner.config import RunConfig
 from learner.place import DEADLINE_S, START_DEADLINE_S, Place
 from learner.presets import PresetName
 from learner.sweep import SweepConfig
 from sim_core.checks import require
-from sim_core.config import MethodName
-
-Switch = Annotated[UseCounterAction[int], arg(help_behavior_hint="(off by default)")]
-"""A flag without a value: 0 unless it is given."""
 
 
 def ray_address(given: str | None) -> str | None:
@@ -117,16 +113,6 @@ class Sweep:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
-    """Draw a sweep's figures and judge the dissertation's claims from its table of results."""
-
-    results: Positional[Path]
-    """A results.csv that `shoal sweep` wrote, or one of those in dashboards/results."""
-    out: Path = Path("runs/report")
-    """Folder for report.md, claims.md and the figures."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Resume(OnRay):
     """Go on with a run from its newest usable checkpoint."""
 
@@ -138,82 +124,6 @@ class Resume(OnRay):
     """Where the learner's networks live; as before by default."""
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Evaluate:
-    """Play a run's greedy policy, or a baseline, on fixed seeds and print its rates with 95 % intervals."""
-
-    run: Positional[str]
-    """Name of the run, or its folder; or fl-orca, greedy or random (a run of such a name: ./NAME)."""
-    episodes: int = 1_000
-    """Episodes to play."""
-    first_seed: int = 2_000_000_000
-    """Seed of the first episode; the others count on."""
-    method: MethodName | None = None
-    """Baselines only: method of the world to play in; sensor by default."""
-    preset: PresetName | None = None
-    """Baselines only: settings of the world to play in, those of `shoal sweep`; the defaults otherwise."""
-    robots: int | None = None
-    """Robots per group; by default those of the training (others: Extrapolation), or 10 for a baseline."""
-    groups: int | None = None
-    """Groups; by default those of the training (others: Extrapolation), or 2 for a baseline."""
-    checkpoint: Literal["newest", "best"] = "newest"
-    """The newest checkpoint's policy, or the one that did best in the evaluations during training."""
-    out: Path | None = None
-    """New file (.zarr) for the results: seed, outcome, length and return of every episode."""
-    record: int = 0
-    """Records the first episodes whole, this many, beside the results in FILE-episodes.zarr; needs --out."""
-    runs_dir: Path = Path("runs")
-    """Folder of all runs."""
-    address: str | None = None
-    """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
-
-    def __post_init__(self) -> None:
-        require(1 <= self.episodes <= 10**7, f"--episodes must be in 1..{10**7}, not {self.episodes}")
-        require(
-            0 <= self.first_seed <= 2**32 - 1 - self.episodes,
-            f"--first-seed must be in 0..{2**32 - 1 - self.episodes}, not {self.first_seed}",
-        )
-        require(
-            0 <= self.record <= self.episodes,
-            f"--record must be in 0..{self.episodes} (--episodes), not {self.record}",
-        )
-        require(self.record == 0 or self.out is not None, "--record needs --out: episodes lie beside the results")
-        require(
-            self.out is None or (self.out.suffix == ".zarr" and bool(self.out.stem)),
-            f"--out must name a file that ends in .zarr, not {str(self.out)!r}",
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Watch:
-    """Render one greedy episode of a run: a web page with a player, a video, or a strip of frames."""
-
-    run: Positional[str]
-    """Name of the run, or its folder."""
-    format: Literal["html", "mp4", "png"] = "html"
-    """Page with a player, video, or strip of frames (other environments than ours: video only)."""
-    seed: int = 2_000_000_000
-    """Seed of the episode."""
-    out: Path | None = None
-    """File to write; `episode-SEED` in the run's artifacts by default."""
-    live: Switch = 0
-    """Look into a running training: a page on 127.0.0.1 that plays the newest checkpoint's policy, again and again."""
-    port: int = 8400
-    """--live: port of the page; 0 takes a free one."""
-    checkpoint: Literal["newest", "best"] = "newest"
-    """The newest checkpoint's policy, or the one that did best in the evaluations during training."""
-    runs_dir: Path = Path("runs")
-    """Folder of all runs."""
-
-    def __post_init__(self) -> None:
-        require(0 <= self.seed < 2**32, f"--seed must be in 0..{2**32 - 1}, not {self.seed}")
-        _check_port(self.port)
-        require(
-            not self.live or (self.format == "html" and self.out is None),
-            "--live plays in a web page and writes no file; leave out --format and --out",
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,28 +154,6 @@ class Chaos:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export:
-    """Write a policy as ONNX and as a torch ExportedProgram, checked against the simulator."""
-
-    run: Positional[str]
-    """Name of the run, or its folder; or one of its checkpoints, or a policy.safetensors in its folder."""
-    bare: bool = False
-    """Observation to action values alone, for any environment; else from what a robot senses to its velocity."""
-    out: Path | None = None
-    """Folder to write, replaced if it is there; `export` or `export-bare` in the run's artifacts by default."""
-    states: int = 10_000
-    """States of rollouts in which both files must answer as the simulator and its policy do."""
-    first_seed: int = 2_000_000_000
-    """Seed of the first episode of these rollouts; the others count on."""
-    runs_dir: Path = Path("runs")
-    """Folder of all runs."""
-
-    def __post_init__(self) -> None:
-        require(1 <= self.states <= 1_000_000, f"--states must be in 1..1000000, not {self.states}")
-        require(0 <= self.first_seed < 2**31, f"--first-seed must be in 0..{2**31 - 1}, not {self.first_seed}")
-
-
-@dataclass(frozen=True, kw_only=True)
 class Submit:
     """Run `shoal train ...` or `shoal sweep ...` as a job of a Ray cluster, and follow its log.
 
@@ -286,36 +174,3 @@ class Submit:
 
     def __post_init__(self) -> None:
         require(self.stop_wait_s >= 1, f"--stop-wait-s must be at least 1, not {self.stop_wait_s}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Dashboard:
-    """Show a sweep or a run as an HTML report with its episodes to play: one file, or a page that follows it live."""
-
-    source: Positional[str]
-    """A sweep (its name, its folder or a results.csv), or a run (its name or its folder)."""
-    out: Path | None = None
-    """File to write; dashboard.html beside the results by default."""
-    serve: Switch = 0
-    """Serve the report on 127.0.0.1 instead of writing it: it follows a running sweep or run, and plays any episode."""
-    port: int = 8400
-    """--serve: port of the page; 0 takes a free one."""
-    episodes: int = 1
-    """Episodes of each policy and outcome that the file takes with it; 0 for none."""
-    episodes_mb: float = 5.0
-    """... as long as all of them together take no more than this many megabytes."""
-    runs_dir: Path = Path("runs")
-    """Folder of all runs and sweeps."""
-
-    def __post_init__(self) -> None:
-        _check_port(self.port)
-        require(self.episodes >= 0, f"--episodes must not be negative, not {self.episodes}")
-        require(self.episodes_mb >= 0, f"--episodes-mb must not be negative, not {self.episodes_mb}")
-        require(not self.serve or self.out is None, "--serve writes no file; leave out --out or --serve")
-
-
-def _check_port(port: int) -> None:
-    require(0 <= port <= 65535, f"--port must be in 0..65535, not {port}")
-
-
-Command = Train | Sweep | Report | Resume | Evaluate | Watch | Dashboard | Chaos | Export | Submit

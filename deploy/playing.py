@@ -19,8 +19,9 @@ from dashboards.strip import episode_strip_png
 from deploy.artifacts import foreign_animation, write_player, write_video
 from deploy.folders import make_folder
 from deploy.live import watch_live
-from deploy.options import Evaluate, Watch, ray_address
+from deploy.options import ray_address
 from deploy.policies import find_policy
+from deploy.result_options import Evaluate, Watch
 from deploy.tables import evaluation_table
 from learner.config import RunConfig
 from learner.presets import preset_config

@@ -21,7 +21,7 @@ from deploy.folders import make_folder, write_text
 from sim_core.checks import require
 
 if TYPE_CHECKING:
-    from deploy.options import Report
+    from deploy.result_options import Report
 
 
 def report(command: Report) -> int:

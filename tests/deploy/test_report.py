@@ -11,8 +11,8 @@ from actors.result_table import ResultRow, write_table
 from dashboards.diagrams import DIAGRAMS
 from dashboards.pooled import Setup
 from dashboards.result_figures import PICTURES
-from deploy.options import Report
 from deploy.report import report
+from deploy.result_options import Report
 from sim_core.checks import ConfigError
 from tests.dashboards.tables import claimed_table, row
 
