@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from actors.locations import as_location, check_writable, inside
+from actors.locations import Location, as_location, check_writable, inside
 from learner.checkpoint_store import open_store
 from learner.run_folder import Storage
 from sim_core.checks import ConfigError, require
@@ -35,6 +35,11 @@ def make_folder(path: Path, flag: str) -> None:
     require(os.access(path, os.W_OK), f"{flag} {path} cannot be written to; name a folder that you may write to")
 
 
+def run_location(checkpoint_url: str, name: str) -> Location:
+    """Where the checkpoints of the run `name` lie under `--checkpoint-url` (see `as_location` for errors)."""
+    return inside(as_location(checkpoint_url), name)
+
+
 def new_storage(checkpoint_url: str | None, name: str, keep_best: int) -> Storage:
     """How a new run `name` stores its checkpoints: under `--checkpoint-url`, in a folder of its own there.
 
@@ -43,12 +48,11 @@ def new_storage(checkpoint_url: str | None, name: str, keep_best: int) -> Storag
     """
     if checkpoint_url is None:
         return Storage(None, keep_best)
-    root = as_location(checkpoint_url)
+    root, location = as_location(checkpoint_url), run_location(checkpoint_url, name)
     if isinstance(root, Path):
         make_folder(root, "--checkpoint-url")
     else:
         check_writable(root)
-    location = inside(root, name)
     try:
         taken = open_store(location).names()
     except OSError as error:

@@ -12,7 +12,7 @@ from rich.console import Console
 from actors.baselines import Baseline
 from actors.vector_env import env_shape
 from deploy.artifacts import log_artifacts
-from deploy.folders import check_lasting, check_plain_name, make_folder, new_storage
+from deploy.folders import check_lasting, check_plain_name, make_folder, new_storage, run_location
 from deploy.options import Launch, Resume, Train
 from deploy.progress import make_display
 from deploy.tables import evaluation_table, summary_lines
@@ -56,6 +56,7 @@ def train(command: Train) -> int:
     folder = _new_folder(config, launch, command.or_resume)
     if folder.has_begun():
         with folder.hold():
+            _check_storage(folder, command.checkpoint_url)
             return _go_on(folder, config, launch.place())
     make_folder(launch.runs_dir, "--runs-dir")
     if launch.ray_address() is None:
@@ -84,6 +85,16 @@ def resume(command: Resume) -> int:
         tracker = _tracker(folder.identity())
         _say_where(checkpoint, skipped)
         return _resumed(folder, config, tracker, checkpoint, command.place())
+
+
+def _check_storage(folder: RunFolder, checkpoint_url: str | None) -> None:
+    """Refuses a `--checkpoint-url` under which the run does not have its checkpoints."""
+    if checkpoint_url is not None:
+        location = folder.checkpoint_location()
+        require(
+            run_location(checkpoint_url, folder.path.name) == location,
+            f"{folder.path} has its checkpoints at {location}; leave out --checkpoint-url, or choose another --name",
+        )
 
 
 def _go_on(folder: RunFolder, config: RunConfig, place: Place) -> int:

@@ -16,6 +16,7 @@ from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock, tra
 from learner.config import RunConfig
 from learner.journal import Journal
 from learner.loop import TrainingLoop
+from learner.place import Place
 from learner.ray_edge import ray_cluster
 from tests.benchmarks.timing import spread
 
@@ -95,7 +96,7 @@ class Told:
 
 def service_rows(config: RunConfig) -> list[tuple[str, list[float]]]:
     """Milliseconds that the loop stood still for each checkpoint, and gaps between updates with and without one."""
-    cluster, told = ray_cluster(config, 0, None), Told()
+    cluster, told = ray_cluster(config, 0, Place()), Told()
     stalls, quiet, writing = [], [], []
     last = (0.0, 0)
     try:
@@ -106,7 +107,7 @@ def service_rows(config: RunConfig) -> list[tuple[str, list[float]]]:
                 now_s = time.perf_counter()
                 if loop.updates > last[1]:
                     if last[1]:
-                        (writing if loop._checkpointer.is_busy else quiet).append(1000 * (now_s - last[0]))
+                        (writing if loop._saver._checkpointer.is_busy else quiet).append(1000 * (now_s - last[0]))
                     last = (now_s, loop.updates)
                 return told.written >= CHECKPOINTS
 

@@ -31,7 +31,7 @@ class Silent:
 def checkpoints(tmp_path_factory) -> Path:
     """The last two checkpoints of a small run with all parts: several workers and shards."""
     folder = tmp_path_factory.mktemp("run")
-    config = dataclasses.replace(SMALL, workers=2, replay_shards=2, total_env_steps=3_000)
+    config = dataclasses.replace(SMALL, workers=2, replay_shards=2, replay="prioritised", total_env_steps=3_000)
     with closing(Journal(folder / "metrics.jsonl", 0)) as journal:
         assert TrainingLoop(
             config, process_cluster(config, 0), journal, folder / "checkpoints", Silent(), lambda: False

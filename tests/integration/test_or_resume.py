@@ -99,3 +99,10 @@ def test_a_run_of_other_settings_and_a_missing_name_are_refused(finished, tmp_pa
     assert "other settings" in capsys.readouterr().err
     assert main(["train", "--or-resume", "True", "--runs-dir", str(tmp_path)]) == 2
     assert "--or-resume needs --name" in capsys.readouterr().err
+
+
+def test_checkpoints_stay_where_the_run_has_them(finished, tmp_path, capsys):
+    assert train(finished, "--checkpoint-url", str(tmp_path / "elsewhere")) == 2
+    error = capsys.readouterr().err
+    assert f"has its checkpoints at {finished / 'r' / 'checkpoints'}" in error and "leave out --checkpoint-url" in error
+    assert not (tmp_path / "elsewhere").exists()

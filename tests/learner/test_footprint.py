@@ -48,5 +48,10 @@ def test_the_estimates_are_those_of_what_is_made(small_run):
     assert parts["replay_capacity"] == learner._shards[0].shard._rows.nbytes
     online = sum(tensor.numel() for tensor in learner._learner.online.state_dict().values())
     assert parts["hidden_sizes"] == online * 4 * 5
+    prioritised = dataclasses.replace(small_run, replay="prioritised", network="dueling")
+    more, (shard, *_) = parts_bytes(prioritised, shape), process_cluster(prioritised, 0).learner._shards
+    tree = prioritised.replay_shards * shard.shard._tree._tree.nbytes
+    assert tree <= more["replay_capacity"] - parts["replay_capacity"] < 2.1 * tree
+    assert more["hidden_sizes"] > parts["hidden_sizes"]
     assert sum(parts.values()) < psutil.virtual_memory().total
     assert all(np.isfinite(value) and value >= 0 for value in parts.values())
