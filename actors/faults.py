@@ -78,6 +78,11 @@ class CallFailed(Exception):
         self.reason = reason
 
 
+def first_line(error: BaseException) -> str:
+    """What an error says, in one line; its kind where it says nothing."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
 class PartFailed(Exception):
     """A part of the run failed.
 

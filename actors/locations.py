@@ -13,6 +13,7 @@ from typing import Any
 
 from fsspec.core import url_to_fs
 
+from actors.faults import first_line
 from sim_core.checks import ConfigError
 
 Location = Path | str
@@ -57,8 +58,7 @@ def storage_errors(location: Location) -> Iterator[None]:
     except (OSError, ConfigError):
         raise
     except Exception as error:
-        first_line = (str(error).splitlines() or [""])[0]
-        raise OSError(f"{location}: {type(error).__name__} {first_line}") from error
+        raise OSError(f"{location}: {type(error).__name__} {first_line(error)}") from error
 
 
 def filesystem(url: str) -> tuple[Any, str]:

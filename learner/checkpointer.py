@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from actors.calls import Calls, Node
-from actors.faults import CallFailed, Fault, Part, PartFailed
+from actors.faults import CallFailed, Fault, Part, PartFailed, first_line
 from actors.locations import Location
 from actors.parts import FileSum, Written, join_written
 from learner.checkpoint import Keep, complete_checkpoint, keep_checkpoints
@@ -133,9 +133,8 @@ class Checkpointer:
         try:
             write()
         except Exception as error:  # a disk's, a storage client's, Ray's: each raises its own, and training goes on
-            reason = (str(error).splitlines() or [""])[0] or type(error).__name__
             failure = error if isinstance(error, PartFailed) else None
-            self._ended = self._ended or Ended(moment, None, reason, failure)
+            self._ended = self._ended or Ended(moment, None, first_line(error), failure)
             self._tidy()
 
     def _tidy(self) -> None:

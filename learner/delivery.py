@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from actors.faults import first_line
 from learner.journal import Journal, PushedMark, Row
 from learner.tracker import TROUBLE, Tracker
 
@@ -17,11 +18,6 @@ FIRST_PAUSE_S = 1.0
 LONGEST_PAUSE_S = 15.0
 LAST_WAIT_S = 1.0
 """Pauses between two attempts double from the first to the longest."""
-
-
-def first_line(error: BaseException) -> str:
-    """An error in one line."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 class Delivery:

@@ -29,7 +29,7 @@ from ray.exceptions import (
 
 from actors.calls import LocalCalls, Node, Ref
 from actors.evaluator import Candidate, evaluate_in_parts
-from actors.faults import CallFailed, Fault, PartFailed
+from actors.faults import CallFailed, Fault, PartFailed, first_line
 from actors.nodes import RolloutNode, ShardNode
 from actors.transitions import EpisodeStats
 from actors.vector_env import EnvSpec, env_shape
@@ -72,12 +72,8 @@ def _as_fault(error: Exception) -> Exception:
         return _as_fault(cause) if isinstance(cause, RayError) else error
     for kinds, fault in FAULTS:
         if isinstance(error, kinds):
-            return CallFailed(fault, _first_line(error))
+            return CallFailed(fault, first_line(error))
     return error
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 class RayCalls:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import closing
 from typing import NamedTuple, Protocol
 
-from actors.faults import Decision, Mended, PartFailed, Recovery
+from actors.faults import Decision, Mended, PartFailed, Recovery, first_line
 from actors.locations import Location
 from actors.network import WeightsSnapshot
 from actors.transitions import EpisodeStats
@@ -14,7 +14,7 @@ from learner.addresses import hide_secrets
 from learner.checkpoint import Checkpoint, newest_valid
 from learner.cluster import Cluster, process_cluster
 from learner.config import RunConfig
-from learner.delivery import Delivery, first_line, insist
+from learner.delivery import Delivery, insist
 from learner.fault_log import FaultLog
 from learner.journal import Journal, PushedMark, Row
 from learner.loop import TrainingLoop

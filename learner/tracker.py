@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import torch
 
+from actors.faults import first_line
 from actors.network import QNetwork, WeightsSnapshot, load_snapshot
 from actors.vector_env import EnvShape
 from learner.addresses import hide_secrets, public_uri
@@ -88,9 +89,9 @@ class Tracker:
                 found.experiment_id if found else self._client.create_experiment(experiment, artifact_root)
             )
         except (MlflowException, SQLAlchemyError, OSError, ValueError, ImportError) as error:
-            first_line = hide_secrets((str(error).splitlines() or [type(error).__name__])[0], uri)
+            reason = hide_secrets(first_line(error), uri)
             raise ConfigError(
-                f"the MLflow store {public_uri(uri)} cannot be opened ({first_line}); name another --tracking-uri"
+                f"the MLflow store {public_uri(uri)} cannot be opened ({reason}); name another --tracking-uri"
             ) from error
 
     @property
