@@ -21,7 +21,7 @@ from learner.mending import RunLost
 from learner.place import Place
 from learner.ray_edge import ray_cluster
 from learner.ray_metrics import RayMetrics
-from learner.results import Evaluation, final_metrics, summarise
+from learner.results import Evaluation, as_metrics, summarise
 from learner.run_folder import RunFolder
 from learner.stopping import stop_on_signals
 from learner.tracker import TROUBLE, Tracker
@@ -157,7 +157,7 @@ def execute(
         if result.evaluation is not None:
             patience_s = tracker.patience_s
             time_ms = rows[-1].time_ms if rows else tracker.started_ms
-            metrics = final_metrics(result.evaluation)
+            metrics = as_metrics(result.evaluation)
             insist(lambda: tracker.final(metrics, time_ms), "the results", patience_s, display.message)
             insist(lambda: finish(result, rows), "the artifacts", patience_s, display.message)
         status = "FINISHED" if result.stopped_by is None else "KILLED"
