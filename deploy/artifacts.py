@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 from actors.evaluator import record_episode, record_frames
@@ -15,7 +14,7 @@ from dashboards.video import episode_frames, write_mp4
 from deploy.folders import write_text
 from learner.config import RunConfig
 from learner.journal import Row
-from learner.results import as_metrics, outcome_label
+from learner.results import as_metrics, outcome_label, score
 from learner.run import RunResult
 from learner.run_folder import RunFolder
 from learner.tracker import Tracker
@@ -28,7 +27,7 @@ VIDEO_SIZE_PX = 480
 
 def log_artifacts(folder: RunFolder, config: RunConfig, tracker: Tracker, result: RunResult, rows: list[Row]) -> None:
     """Makes all artifacts of a finished run and uploads them."""
-    assert result.weights is not None
+    assert result.weights is not None and result.evaluation is not None
     folder.artifacts.mkdir(exist_ok=True)
     made = [folder.path / "config.json", _curve(folder, config, [*rows, _last_row(result)])]
     if config.env.is_swarm:
@@ -38,9 +37,7 @@ def log_artifacts(folder: RunFolder, config: RunConfig, tracker: Tracker, result
         made += foreign_animation(config, result.weights, config.final_eval_first_seed, path)
     for path in made:
         tracker.artifact(path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # MLflow's own, about its schema inference
-        tracker.log_policy(result.weights, config, env_shape(config.env))
+    tracker.log_policy(result.weights, config, env_shape(config.env), score(result.evaluation))
 
 
 def _last_row(result: RunResult) -> Row:

@@ -14,12 +14,26 @@ from typing import NamedTuple
 from sim_core.checks import ConfigError
 
 ACCOUNT = "account/"
-"""Begins the names of counts since the start of the run, which are for monitoring: MLflow's charts want few keys."""
+"""Begins the names of counts since the start of the run."""
+FINAL = "final/"
+"""Begins the names of a run's results."""
+_FOR_MONITORING = ("replay/size", "policy/staleness_s")
+_WITH_INTERVAL = ("final/success_rate", "final/return")
+_ENDS = ("_low", "_high")
 
 
 def charted(metrics: dict[str, float]) -> dict[str, float]:
-    """What of a row goes to MLflow: all but the accounts."""
-    return {name: value for name, value in metrics.items() if not name.startswith(ACCOUNT)}
+    """What of a row goes to MLflow, whose charts want few keys (under 30 of a run).
+
+    Not the accounts nor what only monitoring asks for, and of the intervals that of the result alone.
+    """
+    return {name: value for name, value in metrics.items() if _is_charted(name)}
+
+
+def _is_charted(name: str) -> bool:
+    if name.endswith(_ENDS):
+        return name.startswith(_WITH_INTERVAL)
+    return not name.startswith(ACCOUNT) and name not in _FOR_MONITORING
 
 
 class Row(NamedTuple):

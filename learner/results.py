@@ -35,6 +35,11 @@ def summarise(stats: EpisodeStats) -> Evaluation:
     return Evaluation(total, rates, mean(stats.episode_return), mean(stats.length_steps))
 
 
+def score(evaluation: Evaluation) -> float:
+    """What policies of one setup are compared by: the success rate or, without outcomes, the mean return."""
+    return evaluation.rates.get(Outcome.GOAL, evaluation.episode_return).value
+
+
 def outcome_label(outcome: Outcome) -> str:
     """Metric name of an outcome's rate."""
     return "success_rate" if outcome is Outcome.GOAL else f"{outcome.name.lower()}_rate"
@@ -49,10 +54,3 @@ def as_metrics(evaluation: Evaluation) -> dict[str, float]:
     for name, estimate in estimates.items():
         metrics |= {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
     return {name: value for name, value in metrics.items() if math.isfinite(value)}
-
-
-def final_metrics(evaluation: Evaluation) -> dict[str, float]:
-    """`as_metrics` without the failures' intervals, which the run's last table has: MLflow's charts want few keys."""
-    failures = [outcome_label(kind) for kind in evaluation.rates if kind is not Outcome.GOAL]
-    hidden = {f"{name}{end}" for name in failures for end in ("_low", "_high")}
-    return {name: value for name, value in as_metrics(evaluation).items() if name not in hidden}

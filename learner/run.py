@@ -23,7 +23,7 @@ from learner.mending import RunLost
 from learner.place import Place
 from learner.ray_edge import ray_cluster
 from learner.ray_metrics import RayMetrics
-from learner.results import Evaluation, final_metrics, summarise
+from learner.results import Evaluation, as_metrics, summarise
 from learner.run_folder import RunFolder
 from learner.saved_state import check_config, check_state
 from learner.stopping import stop_on_signals
@@ -181,7 +181,7 @@ def execute(
         if result.evaluation is not None:
             patience_s = tracker.patience_s
             time_ms = rows[-1].time_ms if rows else tracker.started_ms
-            metrics = final_metrics(result.evaluation)
+            metrics = as_metrics(result.evaluation)
             insist(lambda: tracker.final(metrics, time_ms), "the results", patience_s, say)
             insist(lambda: finish(result, rows), "the artifacts", patience_s, say)
         status = "FINISHED" if result.stopped_by is None else "KILLED"

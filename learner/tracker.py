@@ -8,6 +8,7 @@ import os
 import socket
 import subprocess
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,7 +22,7 @@ from actors.network import QNetwork, WeightsSnapshot, load_snapshot
 from actors.vector_env import EnvShape
 from learner.addresses import hide_secrets, public_uri
 from learner.config import RunConfig, config_hash, flat_params
-from learner.journal import Row, charted
+from learner.journal import FINAL, Row, charted
 from learner.views import TAG, packed_view, sweep_views
 from sim_core.checks import ConfigError
 
@@ -36,6 +37,8 @@ from mlflow.exceptions import MlflowException  # noqa: E402
 from mlflow.models import infer_signature  # noqa: E402
 from requests import RequestException  # noqa: E402
 from sqlalchemy.exc import SQLAlchemyError  # noqa: E402
+
+from learner.registry import dataset_inputs, register_policy  # noqa: E402
 
 TROUBLE = (MlflowException, SQLAlchemyError, RequestException)
 """What MLflow's client raises when its store does not do what it should."""
@@ -112,12 +115,13 @@ class Tracker:
         }
         run = self._client.create_run(self._experiment_id, tags={"mlflow.runName": config.name} | known | (tags or {}))
         self.run_id, self.started_ms = run.info.run_id, run.info.start_time
-        self.log_params(config)
+        self.log_inputs(config)
 
-    def log_params(self, config: RunConfig) -> None:
-        """Logs the whole config; what the run has already must be the same."""
+    def log_inputs(self, config: RunConfig) -> None:
+        """Logs the whole config and the episodes it names; what the run has already must be the same."""
         params = [Param(key, str(value)) for key, value in flat_params(config).items()]
         self._client.log_batch(self.run_id, params=params)
+        self._client.log_inputs(self.run_id, datasets=dataset_inputs(config, git_commit()))
 
     def find_run(self, tags: dict[str, str]) -> str | None:
         """Id of the experiment's oldest run that has all `tags`; None if there is none."""
@@ -169,18 +173,26 @@ class Tracker:
 
     def final(self, metrics: dict[str, float], time_ms: int) -> None:
         """Logs the run's results at step 0, where the UI draws them as bars; the same of the same time only once."""
-        self.push([Row(0, time_ms, {f"final/{key}": value for key, value in metrics.items()})])
+        self.push([Row(0, time_ms, {f"{FINAL}{key}": value for key, value in metrics.items()})])
 
-    def log_policy(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> None:
-        """Logs the greedy policy's Q-network as a model with its signature: observations to action values."""
+    def log_policy(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape, score: float) -> None:
+        """Logs and registers the greedy policy's Q-network, a model from observations to action values.
+
+        Args:
+          weights: of the policy.
+          config: the run.
+          shape: its environments'.
+          score: what the registry compares the policies of a setup by.
+        """
         network = QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions)
         load_snapshot(network, weights)
         example = np.zeros((2, *shape.observation_space.shape), np.float32)
         with torch.no_grad():
             values = network(torch.from_numpy(example)).numpy()
         mlflow.set_tracking_uri(self.uri)
-        with mlflow.start_run(run_id=self.run_id):
-            mlflow.pytorch.log_model(
+        with warnings.catch_warnings(), mlflow.start_run(run_id=self.run_id):
+            warnings.simplefilter("ignore")  # MLflow's own, about its schema inference
+            logged = mlflow.pytorch.log_model(
                 network.eval(),
                 name="policy",
                 signature=infer_signature(example, values),
@@ -188,6 +200,7 @@ class Tracker:
                 serialization_format="pt2",
                 pip_requirements=[f"torch=={torch.__version__.split('+')[0]}", f"numpy=={np.__version__}"],
             )
+        register_policy(self._client, config, self.run_id, logged.model_uri, score)
 
     def artifact(self, path: Path) -> None:
         """Uploads a file or a folder to the run's artifacts."""

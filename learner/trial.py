@@ -27,7 +27,7 @@ from learner.config import RunConfig
 from learner.journal import Row
 from learner.place import Place
 from learner.policy_file import read_saved_policy, save_policy
-from learner.results import final_metrics, summarise
+from learner.results import as_metrics, score, summarise
 from learner.run import RunResult, execute, last_checkpoint
 from learner.run_folder import RunFolder, RunIdentity
 from learner.sweep import Cell, SweepConfig, cell_hash, done_cells, other_worlds
@@ -95,7 +95,7 @@ def _start_or_find(cell: Cell, sweep: SweepConfig, folder: RunFolder, place: Swe
     known = tracker.find_run({"cell": cell.key, "sweep": place.sweep})
     if known:
         tracker.resume(known)
-        tracker.log_params(cell.config)  # which a kill may have kept from it
+        tracker.log_inputs(cell.config)  # which a kill may have kept from it
     else:
         tracker.start(cell.config, {"sweep": place.sweep} | _tags(cell, sweep))
     folder.save_config(cell.config)
@@ -156,10 +156,12 @@ def _train(
         tracker.skip_what_is_logged()  # the same cell makes the same rows again, at another time
 
     def finish(result: RunResult, rows: list[Row]) -> None:
-        assert result.weights is not None and result.episodes is not None
-        save_policy(folder.policy, result.weights, cell.config, env_shape(cell.config.env))
+        assert result.weights is not None and result.episodes is not None and result.evaluation is not None
+        shape = env_shape(cell.config.env)
+        save_policy(folder.policy, result.weights, cell.config, shape)
         results = _evaluate_all(sweep, cell, folder, result.weights, result.episodes)
         tracker.artifact(folder.policy)
+        tracker.log_policy(result.weights, cell.config, shape, score(result.evaluation))
         _log_table(results, folder, tracker)
 
     execute(folder, cell.config, tracker, RowDisplay(on_row), checkpoint, Place(), finish)
@@ -180,7 +182,7 @@ def _play_again(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Trac
 def _play_baseline(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker) -> None:
     """Plays a baseline's episodes, of which there is nothing to resume."""
     stats = evaluate(cell.config.env, Baseline(cell.policy), _fixed_seeds(cell))
-    tracker.final(final_metrics(summarise(stats)), tracker.started_ms)
+    tracker.final(as_metrics(summarise(stats)), tracker.started_ms)
     _log_table([_stored(sweep, cell, cell.config, stats, folder, 0)], folder, tracker)
 
 

@@ -36,7 +36,7 @@ def assert_history_is_the_journal(folder: Path, run: str) -> None:
     """Every journal row is in MLflow once, and nothing else is."""
     client, found = the_run(folder)
     rows = [json.loads(line) for line in (folder / "runs" / run / "metrics.jsonl").read_text().splitlines()]
-    for key in ("train/epsilon", "replay/size", "eval/success_rate"):
+    for key in ("train/epsilon", "replay/samples_per_insert", "eval/success_rate"):
         expected = [(steps, values[key]) for steps, _, values in rows if key in values]
         history = [(metric.step, metric.value) for metric in client.get_metric_history(found.info.run_id, key)]
         assert Counter(history) == Counter(expected)
@@ -57,8 +57,8 @@ def test_a_run_over_ray_leaves_everything_a_user_compares(shoal, tmp_path):
     tags = {name: run.data.tags[name] for name in ("method", "robots", "groups", "seed", "engine")}
     assert tags == {"method": "sensor", "robots": "3", "groups": "2", "seed": "0", "engine": "ray"}
     assert len(run.data.tags["mlflow.source.git.commit"]) in (40, len("unknown"))
-    assert len(run.data.metrics) <= 47
-    for key in ("final/success_rate_low", "train/q_mean", "train/td_error", "policy/staleness_updates", "replay/size"):
+    assert len(run.data.metrics) < 30
+    for key in ("final/success_rate_low", "train/q_mean", "train/td_error", "policy/staleness_updates", "eval/return"):
         assert key in run.data.metrics
     artifacts = {item.path for item in client.list_artifacts(run.info.run_id)}
     assert artifacts == {"config.json", "learning_curve.png", "episode.html", "episode.zarr"}

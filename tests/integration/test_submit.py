@@ -3,24 +3,18 @@
 import dataclasses
 import os
 import re
-import shutil
 import signal
-import socket
 import subprocess
 import sys
-import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import mlflow
-import psutil
 import pytest
-import requests
 
 from learner.checkpoint import newest_valid
-from tests.integration.conftest import SMALL, clean_environment, flags
+from tests.integration.conftest import SMALL
+from tests.integration.ray_head import Head, copy_of_the_code, finish, running_head, submit, wait_for
 
 pytestmark = [
     pytest.mark.ray,
@@ -28,123 +22,20 @@ pytestmark = [
     pytest.mark.timeout(900),
     pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:DeprecationWarning"),  # MLflow's own query
 ]
-ROOT = Path(__file__).parents[2]
-PORTS = (
-    "port dashboard-port ray-client-server-port dashboard-agent-listen-port dashboard-agent-grpc-port "
-    "runtime-env-agent-port metrics-export-port"
-).split()
 LONG = dataclasses.replace(
     SMALL, env_id="CartPole-v1", engine="ray", total_env_steps=150_000, checkpoint_every_env_steps=5_000
 )
 
 
-def free_ports(count: int) -> list[int]:
-    sockets = [socket.socket() for _ in range(count)]
-    for each in sockets:
-        each.bind(("127.0.0.1", 0))
-    ports = [each.getsockname()[1] for each in sockets]
-    for each in sockets:
-        each.close()
-    return ports
-
-
-class Head(NamedTuple):
-    """A running head node: its dashboard, and the folder of its session."""
-
-    address: str
-    session: Path
-
-
-def answers(url: str) -> bool:
-    try:
-        return requests.get(url, timeout=10).status_code == 200
-    except requests.RequestException:
-        return False
-
-
-def wait_for(condition, log, process: subprocess.Popen) -> None:
-    deadline_s = time.monotonic() + 240
-    while not condition():
-        assert process.poll() is None, log()
-        assert time.monotonic() < deadline_s, log()
-        time.sleep(0.2)
-
-
-def start_head(folder: Path, log: Path) -> tuple[subprocess.Popen, str]:
-    """(`ray start --head` on this machine alone, as a user starts it on a laptop, and its dashboard's address)."""
-    ports = dict(zip(PORTS, free_ports(len(PORTS)), strict=True))
-    binaries = str(Path(sys.executable).parent)
-    environment = {**clean_environment(), "RAY_AUTH_MODE": "disabled"}
-    environment["PATH"] = f"{binaries}:{environment['PATH']}"
-    environment.pop("PYTHONPATH", None)  # a job's code is what was uploaded
-    flags = [f"--{name}={port}" for name, port in ports.items()]
-    command = [f"{binaries}/ray", "start", "--head", "--block", "--num-cpus=3", "--disable-usage-stats", *flags]
-    command += ["--node-ip-address=127.0.0.1", "--dashboard-host=127.0.0.1", f"--temp-dir={folder}"]
-    with log.open("w") as file:
-        process = subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
-    while process.poll() is None and "Ray runtime started" not in log.read_text():
-        time.sleep(0.2)
-    return process, f"http://127.0.0.1:{ports['dashboard-port']}"
-
-
 @pytest.fixture(scope="module")
 def head(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Head]:
-    """A running head node; it is started again where Ray's own 30 s for it were too short on a busy machine."""
-    log = tmp_path_factory.mktemp("head") / "log"
-    folder = Path(tempfile.mkdtemp(prefix="sh", dir="/tmp"))  # short: Ray's sockets lie in it
-    for _ in range(3):
-        process, address = start_head(folder, log)
-        if process.poll() is None or "timed out during startup" not in log.read_text():
-            break
-    assert process.poll() is None, log.read_text()
-    family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
-    try:
-        wait_for(lambda: answers(f"{address}/api/jobs/"), log.read_text, process)
-        yield Head(address, folder / "session_latest")
-    finally:
-        process.terminate()
-        process.wait(60)
-        for left in psutil.wait_procs(family, timeout=20)[1]:
-            left.kill()
-        shutil.rmtree(folder, ignore_errors=True)
+    with running_head(tmp_path_factory.mktemp("head") / "log", "--num-cpus=3") as running:
+        yield running
 
 
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A checkout with what must not be uploaded in it."""
-    folder = tmp_path_factory.mktemp("checkout") / "shoal"
-    folder.mkdir()
-    ignored = shutil.ignore_patterns("__pycache__", "results", "images")
-    for package in ("sim_core", "actors", "learner", "deploy", "dashboards"):
-        shutil.copytree(ROOT / package, folder / package, ignore=ignored)
-    shutil.copy(ROOT / ".gitignore", folder)
-    for planted in (
-        ".venv/bin/python",
-        "runs/old/config.json",
-        ".git/HEAD",
-        ".hypothesis/x",
-        "deploy/__pycache__/a.pyc",
-    ):
-        (folder / planted).parent.mkdir(parents=True, exist_ok=True)
-        (folder / planted).write_text("not for the cluster")
-    return folder
-
-
-def submit(head: Head, checkout: Path, runs: Path, log: Path, *options: str) -> subprocess.Popen:
-    """`shoal submit train` of the long run, in the background."""
-    words = ["submit", "--address", head.address, *options, "train", "--runs-dir", str(runs), *flags(LONG)]
-    with log.open("w") as file:
-        return subprocess.Popen(
-            [sys.executable, "-W", "error::DeprecationWarning:__main__", "-m", "deploy", *words],
-            cwd=checkout,
-            env={**clean_environment(), "RAY_AUTH_MODE": "disabled", "PYTHONPATH": str(checkout)},
-            stdout=file,
-            stderr=subprocess.STDOUT,
-        )
-
-
-def finish(process: subprocess.Popen, log: Path) -> tuple[int, str]:
-    return process.wait(400), log.read_text()
+    return copy_of_the_code(tmp_path_factory.mktemp("checkout") / "shoal")
 
 
 def the_run(runs: Path):
@@ -155,10 +46,10 @@ def the_run(runs: Path):
 
 def test_stop_saves_a_checkpoint_and_the_same_command_goes_on(head, checkout, tmp_path):
     runs, log = tmp_path / "runs", tmp_path / "log"
-    first = submit(head, checkout, runs, log)
+    first = submit(head, checkout, LONG, runs, log)
     wait_for(lambda: len(list(runs.glob("*/checkpoints/step-*[0-9]"))) >= 2, log.read_text, first)
 
-    watching = submit(head, checkout, runs, tmp_path / "other", "--follow", "False")
+    watching = submit(head, checkout, LONG, runs, tmp_path / "other", "--follow", "False")
     code, text = finish(watching, tmp_path / "other")
     assert code == 0 and re.search(r"following job shoal-train-CartPole-v1-s0-\w+-1, which is under way", text), text
 
@@ -174,21 +65,21 @@ def test_stop_saves_a_checkpoint_and_the_same_command_goes_on(head, checkout, tm
     assert stopped_at == int(found[1].replace(",", "")) < LONG.total_env_steps
     assert the_run(runs).info.status == "KILLED"
 
-    code, text = finish(submit(head, checkout, runs, log), log)
+    code, text = finish(submit(head, checkout, LONG, runs, log), log)
     assert code == 0, text
     assert f"going on from {checkpoint.folder}" in text
     assert re.search(r"job shoal-train-CartPole-v1-s0-\w+-2 on", text)
     assert newest_valid(run / "checkpoints")[0].state["env_steps"] >= LONG.total_env_steps
     assert (the_run(runs).info.status, the_run(runs).data.tags["attempts"]) == ("FINISHED", "2")
 
-    code, text = finish(submit(head, checkout, runs, log), log)
+    code, text = finish(submit(head, checkout, LONG, runs, log), log)
     assert code == 0 and "has finished before" in text, text
     assert the_run(runs).data.tags["attempts"] == "2"
 
 
 def test_what_git_ignores_is_not_uploaded(head, checkout, tmp_path):
     log = tmp_path / "log"
-    code, text = finish(submit(head, checkout, Path("/proc/nothing"), log), log)
+    code, text = finish(submit(head, checkout, LONG, Path("/proc/nothing"), log), log)
     assert code == 2, text
     assert "--runs-dir /proc/nothing" in text and "Traceback" not in text
     (copy,) = (path.parent.parent for path in head.session.glob("runtime_resources/working_dir_files/*/deploy/cli.py"))

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from learner.journal import Journal, PushedMark, Row, read_rows
+from learner.journal import Journal, PushedMark, Row, charted, read_rows
 from sim_core.checks import ConfigError
 
 ROWS = [Row(100 * i, 1_700_000_000_000 + i, {"a/b": i / 3, "c": float(i)}) for i in range(5)]
@@ -112,3 +112,9 @@ def test_rows_are_read_while_they_are_written(tmp_path):
     with path.open("ab") as file:
         file.write(b'[3, 4, {"a"')  # a row of which a part is written
     assert read_rows(path) == [Row(1, 2, {"a": 0.5})]
+
+
+def test_mlflow_gets_no_accounts_and_no_interval_but_the_results():
+    kept = {"final/success_rate": 0.5, "final/success_rate_low": 0.4, "final/return_high": 2.0, "eval/lost_rate": 0.1}
+    names = "account/produced replay/size policy/staleness_s eval/success_rate_low eval/return_high final/lost_rate_low"
+    assert charted(kept | dict.fromkeys(names.split(), 1.0)) == kept

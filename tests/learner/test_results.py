@@ -5,7 +5,7 @@ import pytest
 
 from actors.estimates import rate
 from actors.transitions import NO_OUTCOME, EpisodeStats
-from learner.results import as_metrics, final_metrics, outcome_label, summarise
+from learner.results import as_metrics, outcome_label, score, summarise
 from sim_core.outcomes import ENDED, Outcome
 
 
@@ -51,11 +51,6 @@ def test_no_episodes_are_refused():
         summarise(episodes([]))
 
 
-def test_final_metrics_leave_out_the_failures_intervals():
-    evaluation = summarise(episodes([1, 1, 2, 5]))
-    every, final = as_metrics(evaluation), final_metrics(evaluation)
-    ends = {f"{name}_rate{end}" for name in ("lost", "captured", "collision", "timeout") for end in ("_low", "_high")}
-    assert final == {name: value for name, value in every.items() if name not in ends}
-    assert {"success_rate_low", "success_rate_high", "lost_rate"} <= final.keys()
-    plain = summarise(episodes([NO_OUTCOME] * 3))
-    assert final_metrics(plain) == as_metrics(plain)
+def test_policies_are_compared_by_success_and_without_outcomes_by_return():
+    assert score(summarise(episodes([1, 1, 2, 5]))) == 0.5
+    assert score(summarise(episodes([NO_OUTCOME] * 4))) == 0.75

@@ -150,10 +150,9 @@ def policy(small_run):
     return Learner(settings_of(small_run, shape)).weights(0.0), shape
 
 
-@pytest.mark.filterwarnings("ignore:.*Any type hint is inferred as AnyType:UserWarning")  # MLflow's own types
 def test_the_logged_policy_gives_the_same_values(tracker, policy, small_run):
     weights, shape = policy
-    tracker.log_policy(weights, small_run, shape)
+    tracker.log_policy(weights, small_run, shape, 0.5)
     observation = np.random.default_rng(0).integers(-5, 6, (7, shape.observation_size)).astype(np.float32)
     mlflow.set_tracking_uri(tracker.uri)
     model_uri = f"runs:/{tracker.run_id}/policy"
@@ -164,6 +163,43 @@ def test_the_logged_policy_gives_the_same_values(tracker, policy, small_run):
     assert info.signature.inputs.inputs[0].shape == (-1, shape.observation_size)
     assert info.signature.outputs.inputs[0].shape == (-1, shape.num_actions)
     assert mlflow.active_run() is None
+
+
+def test_the_registry_has_every_run_once_and_the_best_under_an_alias(store, policy, small_run):
+    weights, shape = policy
+    config = dataclasses.replace(small_run, world=dataclasses.replace(small_run.world, robots=4, groups=3))
+    runs = {}
+    for score in (0.5, 0.75, 0.25, 0.75):
+        tracker = Tracker(store[0], "registry", store[1])
+        tracker.start(config)
+        for _ in range(2):  # as when the server fails after the first
+            tracker.log_policy(weights, config, shape, score)
+        runs[tracker.run_id] = score
+    client = mlflow.MlflowClient(store[0])
+    versions = client.search_model_versions("name = 'sensor-4r-3g'")
+    assert {version.run_id: float(version.tags["score"]) for version in versions} == runs and len(versions) == 4
+    best = client.get_model_version_by_alias("sensor-4r-3g", "best")
+    assert best.run_id == list(runs)[1]
+    model = mlflow.pytorch.load_model("models:/sensor-4r-3g@best")
+    example = np.ones((1, shape.observation_size), np.float32)
+    with torch.no_grad():
+        values = model(torch.from_numpy(example)).numpy()
+    np.testing.assert_allclose(values, Policy(weights).values(example), rtol=1e-5, atol=1e-6)
+
+
+def test_the_episodes_of_training_and_evaluation_are_datasets(store, small_run):
+    def logged(config):
+        tracker = Tracker(store[0], "datasets", store[1])
+        tracker.start(config)
+        tracker.log_inputs(config)  # as a sweep's cell does that goes on
+        inputs = run_of(tracker).inputs.dataset_inputs
+        return {entry.tags[0].value: (entry.dataset.name, entry.dataset.digest) for entry in inputs}
+
+    first, other_seed = logged(small_run), logged(dataclasses.replace(small_run, seed=4))
+    assert first.keys() == {"training", "evaluation"} and {name for name, _ in first.values()} == {"sensor-3r-2g"}
+    assert first["evaluation"] == other_seed["evaluation"] and first["training"] != other_seed["training"]
+    slower = dataclasses.replace(small_run, world=dataclasses.replace(small_run.world, max_speed_m_s=0.5))
+    assert logged(slower)["evaluation"] != first["evaluation"]
 
 
 @pytest.mark.parametrize("uri", ["http://127.0.0.1:9", "https://127.0.0.1:9", "http://no-such-host.invalid"])

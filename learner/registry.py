@@ -1,0 +1,84 @@
+"""What a run takes from and gives to MLflow beside metrics: its episodes as datasets, its policy in the model registry.
+
+One registered model a setup, such as `sensor-10r-2g`, whose versions are the policies of its finished runs; the
+alias `best` is on the one that scored highest.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+
+from mlflow import MlflowClient
+from mlflow.entities import Dataset, DatasetInput, InputTag
+from mlflow.entities.model_registry import ModelVersion
+from mlflow.exceptions import MlflowException
+from mlflow.protos.databricks_pb2 import RESOURCE_ALREADY_EXISTS, ErrorCode
+from mlflow.utils.mlflow_tags import MLFLOW_DATASET_CONTEXT
+
+from learner.config import RunConfig, config_hash
+
+BEST = "best"
+"""Alias of the version with the highest score."""
+SCORE = "score"
+"""Tag of a version: success rate or, where episodes have no outcome, mean return of the run's last evaluation."""
+
+
+def model_name(config: RunConfig) -> str:
+    """Name of the registered model of a run's setup."""
+    world = config.world
+    return f"{world.method}-{world.robots}r-{world.groups}g" if config.env.is_swarm else config.env_id.replace("/", "-")
+
+
+def register_policy(client: MlflowClient, config: RunConfig, run_id: str, model_uri: str, score: float) -> None:
+    """Makes a run's logged model a version of its setup's; one that the run has already stays as it is.
+
+    Args:
+      client: of the store.
+      config: the run.
+      run_id: its MLflow run.
+      model_uri: the logged model.
+      score: what versions are compared by.
+    """
+    name = model_name(config)
+    _make_model(client, name)
+    versions: list[ModelVersion] = list(client.search_model_versions(f"name = '{name}'"))
+    if all(version.run_id != run_id for version in versions):
+        tags = {SCORE: repr(float(score)), "config_hash": config_hash(config), "seed": str(config.seed)}
+        versions.append(client.create_model_version(name, model_uri, run_id, tags))
+    ranked = [version for version in versions if SCORE in version.tags]
+    best = max(ranked, key=lambda version: (float(version.tags[SCORE]), -int(version.version)))
+    client.set_registered_model_alias(name, BEST, best.version)
+
+
+def _make_model(client: MlflowClient, name: str) -> None:
+    try:
+        client.create_registered_model(name)
+    except MlflowException as error:
+        if error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
+            raise
+
+
+def dataset_inputs(config: RunConfig, commit: str) -> list[DatasetInput]:
+    """The episodes that a run learns from, and those that its result is measured on.
+
+    Two runs share a dataset if they play the same worlds under the same seeds.
+
+    Args:
+      config: the run.
+      commit: that of the code which makes the episodes.
+    """
+    evaluation = {"first_seed": config.final_eval_first_seed, "episodes": config.final_eval_episodes}
+    return [
+        _dataset(config, commit, "training", {"seed": config.seed, "env_steps": config.total_env_steps}),
+        _dataset(config, commit, "evaluation", evaluation),
+    ]
+
+
+def _dataset(config: RunConfig, commit: str, context: str, profile: dict[str, int]) -> DatasetInput:
+    plays = dataclasses.asdict(config.world) if config.env.is_swarm else {"env_id": config.env_id}
+    digest = hashlib.sha256(json.dumps(plays | profile, sort_keys=True).encode()).hexdigest()[:8]
+    source = json.dumps({"tags": {"mlflow.source.git.commit": commit}})
+    dataset = Dataset(model_name(config), digest, "code", source, profile=json.dumps(profile))
+    return DatasetInput(dataset, [InputTag(MLFLOW_DATASET_CONTEXT, context)])

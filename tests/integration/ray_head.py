@@ -1,0 +1,174 @@
+"""A head node as `ray start --head` makes it, nodes that join it, and jobs that `shoal submit` gives it."""
+
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import psutil
+import requests
+
+from learner.config import RunConfig
+from tests.integration.conftest import clean_environment, flags
+
+ROOT = Path(__file__).parents[2]
+HEAD_PORTS = ("port", "dashboard-port", "ray-client-server-port")
+NODE_PORTS = (
+    "dashboard-agent-listen-port",
+    "dashboard-agent-grpc-port",
+    "runtime-env-agent-port",
+    "metrics-export-port",
+)
+
+
+def free_ports(count: int) -> list[int]:
+    sockets = [socket.socket() for _ in range(count)]
+    for each in sockets:
+        each.bind(("127.0.0.1", 0))
+    ports = [each.getsockname()[1] for each in sockets]
+    for each in sockets:
+        each.close()
+    return ports
+
+
+class Head(NamedTuple):
+    """A running head node: its dashboard, the address that nodes join, and the folder of its session."""
+
+    address: str
+    gcs: str
+    session: Path
+
+
+def answers(url: str) -> bool:
+    try:
+        return requests.get(url, timeout=10).status_code == 200
+    except requests.RequestException:
+        return False
+
+
+def wait_for(condition, log, process: subprocess.Popen) -> None:
+    deadline_s = time.monotonic() + 240
+    while not condition():
+        assert process.poll() is None, log()
+        assert time.monotonic() < deadline_s, log()
+        time.sleep(0.2)
+
+
+def ray_start(log: Path, *words: str) -> subprocess.Popen:
+    """`ray start --block` on this machine alone, once it has started or ended."""
+    binaries = str(Path(sys.executable).parent)
+    environment = {**clean_environment(), "RAY_AUTH_MODE": "disabled"}
+    environment["PATH"] = f"{binaries}:{environment['PATH']}"
+    environment.pop("PYTHONPATH", None)  # a job's code is what was uploaded
+    command = [f"{binaries}/ray", "start", "--block", "--disable-usage-stats", "--node-ip-address=127.0.0.1", *words]
+    with log.open("w") as file:
+        process = subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
+    while process.poll() is None and "Ray runtime started" not in log.read_text():
+        time.sleep(0.2)
+    return process
+
+
+def with_free_ports(*names: str) -> dict[str, int]:
+    return dict(zip(names, free_ports(len(names)), strict=True))
+
+
+def as_flags(ports: dict[str, int]) -> list[str]:
+    return [f"--{name}={port}" for name, port in ports.items()]
+
+
+def start_head(folder: Path, log: Path, *words: str) -> tuple[subprocess.Popen, dict[str, int]]:
+    """(`ray start --head`, as a user starts it on a laptop, and its ports)."""
+    ports = with_free_ports(*HEAD_PORTS, *NODE_PORTS)
+    words = ("--head", "--dashboard-host=127.0.0.1", f"--temp-dir={folder}", *words)
+    return ray_start(log, *words, *as_flags(ports)), ports
+
+
+def end(process: subprocess.Popen) -> None:
+    """Ends a node and what it started."""
+    family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
+    process.terminate()
+    process.wait(60)
+    for left in psutil.wait_procs(family, timeout=20)[1]:
+        left.kill()
+
+
+@contextmanager
+def running_head(log: Path, *words: str) -> Iterator[Head]:
+    """A head node; it is started again where Ray's own 30 s for it were too short on a busy machine."""
+    folder = Path(tempfile.mkdtemp(prefix="sh", dir="/tmp"))  # short: Ray's sockets lie in it
+    for _ in range(3):
+        process, ports = start_head(folder, log, *words)
+        if process.poll() is None or "timed out during startup" not in log.read_text():
+            break
+    assert process.poll() is None, log.read_text()
+    address = f"http://127.0.0.1:{ports['dashboard-port']}"
+    try:
+        wait_for(lambda: answers(f"{address}/api/jobs/"), log.read_text, process)
+        yield Head(address, f"127.0.0.1:{ports['port']}", folder / "session_latest")
+    finally:
+        end(process)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def joined_node(head: Head, log: Path, *words: str) -> Iterator[subprocess.Popen]:
+    """Another node of the head's cluster, with a folder of its own: in a shared one, nodes delete each other's code."""
+    folder = Path(tempfile.mkdtemp(prefix="sh", dir="/tmp"))
+    ports = with_free_ports(*NODE_PORTS)
+    node = ray_start(log, f"--address={head.gcs}", f"--temp-dir={folder}", *words, *as_flags(ports))
+    assert node.poll() is None, log.read_text()
+    try:
+        yield node
+    finally:
+        if node.poll() is None:
+            end(node)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def kill(node: subprocess.Popen) -> None:
+    """Takes a node away as a power cut does: all of its processes at once."""
+    for process in [*psutil.Process(node.pid).children(recursive=True), psutil.Process(node.pid)]:
+        process.kill()
+    node.wait(30)
+
+
+def copy_of_the_code(folder: Path) -> Path:
+    """A checkout with what must not be uploaded in it."""
+    folder.mkdir()
+    ignored = shutil.ignore_patterns("__pycache__", "results", "images")
+    for package in ("sim_core", "actors", "learner", "deploy", "dashboards"):
+        shutil.copytree(ROOT / package, folder / package, ignore=ignored)
+    shutil.copy(ROOT / ".gitignore", folder)
+    for planted in (
+        ".venv/bin/python",
+        "runs/old/config.json",
+        ".git/HEAD",
+        ".hypothesis/x",
+        "deploy/__pycache__/a.pyc",
+    ):
+        (folder / planted).parent.mkdir(parents=True, exist_ok=True)
+        (folder / planted).write_text("not for the cluster")
+    return folder
+
+
+def submit(head: Head, checkout: Path, config: RunConfig, runs: Path, log: Path, *options: str) -> subprocess.Popen:
+    """`shoal submit train` in the background."""
+    words = ["submit", "--address", head.address, *options, "train", "--runs-dir", str(runs), *flags(config)]
+    with log.open("w") as file:
+        return subprocess.Popen(
+            [sys.executable, "-W", "error::DeprecationWarning:__main__", "-m", "deploy", *words],
+            cwd=checkout,
+            env={**clean_environment(), "RAY_AUTH_MODE": "disabled", "PYTHONPATH": str(checkout)},
+            stdout=file,
+            stderr=subprocess.STDOUT,
+        )
+
+
+def finish(process: subprocess.Popen, log: Path) -> tuple[int, str]:
+    return process.wait(400), log.read_text()
