@@ -133,7 +133,8 @@ class Checkpointer:
         try:
             write()
         except Exception as error:  # a disk's, a storage client's, Ray's: each raises its own, and training goes on
-            failure = error if isinstance(error, PartFailed) else None
+            # a new one: references in the traceback must not outlive Ray
+            failure = PartFailed(*error.args) if isinstance(error, PartFailed) else None
             self._ended = self._ended or Ended(moment, None, first_line(error), failure)
             self._tidy()
 
