@@ -31,14 +31,14 @@ def model_name(config: RunConfig) -> str:
     return f"{world.method}-{world.robots}r-{world.groups}g" if config.env.is_swarm else config.env_id.replace("/", "-")
 
 
-def register_policy(client: MlflowClient, config: RunConfig, run_id: str, model_uri: str, score: float) -> None:
+def register_policy(client: MlflowClient, config: RunConfig, run_id: str, model_id: str, score: float) -> None:
     """Makes a run's logged model a version of its setup's; one that the run has already stays as it is.
 
     Args:
       client: of the store.
       config: the run.
       run_id: its MLflow run.
-      model_uri: the logged model.
+      model_id: of the logged model.
       score: what versions are compared by.
     """
     name = model_name(config)
@@ -46,7 +46,7 @@ def register_policy(client: MlflowClient, config: RunConfig, run_id: str, model_
     versions: list[ModelVersion] = list(client.search_model_versions(f"name = '{name}'"))
     if all(version.run_id != run_id for version in versions):
         tags = {SCORE: repr(float(score)), "config_hash": config_hash(config), "seed": str(config.seed)}
-        versions.append(client.create_model_version(name, model_uri, run_id, tags))
+        versions.append(client.create_model_version(name, f"models:/{model_id}", run_id, tags, model_id=model_id))
     ranked = [version for version in versions if SCORE in version.tags]
     best = max(ranked, key=lambda version: (float(version.tags[SCORE]), -int(version.version)))
     client.set_registered_model_alias(name, BEST, best.version)
