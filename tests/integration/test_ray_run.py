@@ -41,7 +41,7 @@ def assert_history_is_the_journal(folder: Path, run: str) -> None:
         history = [(metric.step, metric.value) for metric in client.get_metric_history(found.info.run_id, key)]
         assert Counter(history) == Counter(expected)
         assert len({steps for steps, _ in history}) == len(history), "a step stands twice"
-        assert len(history) >= 2
+        assert len(history) >= (1 if key.startswith("eval/") else 2)  # a checkpoint that is due holds up the next one
 
 
 def test_a_run_over_ray_leaves_everything_a_user_compares(shoal, tmp_path):
