@@ -4,6 +4,7 @@ import dataclasses
 import re
 import time
 
+import mlflow
 import pytest
 
 from deploy.chaos_checks import complaints
@@ -52,7 +53,10 @@ def test_metrics_of_an_outage_of_mlflow_arrive_later_and_once(server, tmp_path):
         if job.process.poll() is None:
             job.process.kill()
             job.process.wait()
+    version = mlflow.MlflowClient(server.uri).get_model_version_by_alias("sensor-3r-2g", "best")
+    assert version.run_id == folder.identity().mlflow_run_id
     output = job.log.read_text()
+    assert "MLflow did not take" not in output.split("MLflow takes the metrics again")[1], "a server refuses nothing"
     assert "MLflow does not take the metrics, they are kept and sent again" in output
     assert "MLflow takes the metrics again; none is missing" in output
     assert "Traceback" not in output
