@@ -30,7 +30,7 @@ class OnRay:
     deadline_s: float = DEADLINE_S
     """Seconds of silence after which a part of the run that owes an answer is replaced (Ray only)."""
     start_deadline_s: float = START_DEADLINE_S
-    """The same for a part that is being started or saved."""
+    """The same for a part that is being started or restored."""
 
     def __post_init__(self) -> None:
         require(self.deadline_s >= 1, f"--deadline-s must be at least 1, not {self.deadline_s}")

@@ -47,6 +47,11 @@ class Cluster(NamedTuple):
     abandon: Callable[[], None]
     close: Callable[[], None]
 
+    @property
+    def queue_deadline_s(self) -> float:
+        """The deadline of a part that first does what it was told before, each call of it within `deadline_s`."""
+        return self.deadline_s * (1 + max(self.collects_in_flight, self.updates_in_flight))
+
     def capacities(self, config: RunConfig) -> list[int]:
         """Transitions that each target can hold."""
         if not self.shards_are_parts:

@@ -79,7 +79,7 @@ class TrainingLoop:
         self._progress = Progress(config, self._pacer, self._ledger)
         self._under_way = UnderWay(len(cluster.workers), cluster.deadline_s, cluster.start_deadline_s)
         self._mender = Mender(cluster, recovery or Recovery(), self._under_way, self._pacer, self._ledger, observer)
-        checkpointer = Checkpointer(checkpoints, cluster.calls, cluster.start_deadline_s)
+        checkpointer = Checkpointer(checkpoints, cluster.calls, cluster.queue_deadline_s)
         self._saver = Saver(config, keep_best, checkpointer, self._mender, self._progress, journal, observer)
         self._weights: Ref = None
 

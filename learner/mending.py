@@ -13,8 +13,8 @@ from learner.ledger import Ledger
 from learner.pacing import Pacer
 from learner.under_way import UnderWay
 
-SLOW = ("save", "load")
-"""Calls that write or read the whole of a part."""
+SLOW = ("load",)
+"""Calls that read the whole of a part."""
 
 
 class RunLost(Exception):

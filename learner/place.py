@@ -7,7 +7,7 @@ from typing import NamedTuple
 DEADLINE_S = 300.0
 """A part that owes an answer and is silent for so long is late, unless another deadline is given."""
 START_DEADLINE_S = 300.0
-"""A part that is being started or saved may take so long to answer: it loads libraries, or waits for a free CPU."""
+"""A part that is being started or restored may take so long to answer: it loads libraries, or waits for a free CPU."""
 
 
 class Place(NamedTuple):
