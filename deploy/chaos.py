@@ -12,7 +12,7 @@ import psutil
 from rich.console import Console
 from rich.table import Table
 
-from deploy.chaos_checks import complaints
+from deploy.chaos_checks import complaints, success
 from deploy.chaos_config import CONFIG, NAME, write_config
 from deploy.chaos_processes import Driver, TrackingServer, fill_disk, network_delay
 from deploy.folders import make_folder
@@ -262,8 +262,9 @@ def chaos(command: Chaos) -> int:
         code = run.watch()
         faults = with_recovery(run.injected, read_faults(run.folder.faults)) + run.outages
         wrong = complaints(run.folder) if code == 0 else [f"exit code {code}:\n{run.driver.tail(30)}"]
+        learned = success(run.folder) if code == 0 else ""
     except TimeoutError as error:
-        faults, wrong = run.injected + run.outages, [str(error)]
+        faults, wrong, learned = run.injected + run.outages, [str(error)], ""
     finally:
         run.end()
     console.print(table(faults))
@@ -271,4 +272,5 @@ def chaos(command: Chaos) -> int:
         console.print(complaint, markup=False, highlight=False, soft_wrap=True)
     if not wrong:
         console.print(f"{len(faults)} faults; target reached, accounts balance, MLflow has every row once")
+        console.print(f"success rate {learned}", highlight=False)
     return 1 if wrong else 0
