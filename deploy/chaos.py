@@ -1,19 +1,20 @@
-"""`shoal chaos`: trains while a seeded schedule kills, freezes and delays the run's processes, and counts the cost."""
+"""`shoal chaos`: trains while a seeded schedule kills and freezes processes, fills disks and delays messages."""
 
 from __future__ import annotations
 
 import random
 import statistics
 import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 import psutil
 from rich.console import Console
 from rich.table import Table
 
-from deploy.chaos_checks import complaints
+from deploy.chaos_checks import complaints, success
 from deploy.chaos_config import CONFIG, NAME, write_config
-from deploy.chaos_processes import Driver, TrackingServer
+from deploy.chaos_processes import Driver, TrackingServer, fill_disk, network_delay
 from deploy.folders import make_folder
 from deploy.options import Chaos
 from learner.checkpoint import finished_names
@@ -25,11 +26,16 @@ from sim_core.checks import require
 POLL_S = 0.1
 LOOK_S = 20.0
 """How long to look for a victim of the kind that was drawn, such as an evaluation, before another is drawn."""
+FULL_S = 8.0
+"""A process finds its disk full for so long, in which a checkpoint is likely to come."""
 DELAY_S = 2.0
 """A delayed process is stopped for so long, which is less than the deadline."""
 OUTAGE_S = 6.0
 """A killed MLflow server is away for so long."""
 MLFLOW = "MLflow server"
+FULL = "with a full disk"
+PASSING = ("delayed", FULL)
+"""What a process recovers from by itself."""
 
 
 class Kind(NamedTuple):
@@ -53,6 +59,9 @@ KINDS = (
     Kind("delayed", "rollout worker", 1),
     Kind("delayed", "replay shard", 1),
     Kind("delayed", "learner", 1),
+    Kind(FULL, "rollout worker", 1),
+    Kind(FULL, "replay shard", 1),
+    Kind(FULL, "learner", 1),
 )
 
 
@@ -73,12 +82,12 @@ class _ChaosRun:
         self._rng = random.Random(command.seed)
         self.folder = RunFolder(command.out / NAME)
         self.server = TrackingServer(command.out)
-        self.driver = Driver(command.out / "driver.log")
+        self.driver = Driver(command.out / "driver.log", network_delay(command.network_delay_ms))
         self.injected: list[Injected] = []
         self.outages: list[Injected] = []
         self._server_back_s = 0.0
         self._outage: tuple[float, int] | None = None
-        self._continue: list[tuple[float, psutil.Process]] = []
+        self._undo: list[tuple[float, Callable[[], None]]] = []
         self._setback: set[str] | None = set()
         self._drawn: tuple[Kind, float] | None = None
 
@@ -103,7 +112,7 @@ class _ChaosRun:
         while (code := self.driver.exit_code()) is None or self._outage is not None:
             if time.monotonic() > end_s:
                 raise TimeoutError(f"no end after {self._command.limit_s:.0f} s:\n{self.driver.tail(30)}")
-            self._undo_delays()
+            self._undo_what_passed()
             self._mend_server()
             if code is None and time.monotonic() >= next_s and self._may_hurt() and self._hurt():
                 next_s = time.monotonic() + self._rng.uniform(0.5, 1.5) * self._command.every_s
@@ -161,17 +170,22 @@ class _ChaosRun:
         self.driver.start("resume", NAME, *self._flags(False))
 
     def _apply(self, kind: Kind, victim: psutil.Process) -> None:
-        if kind.victim == "learner" and kind.what != "delayed":
+        if kind.victim == "learner" and kind.what not in PASSING:
             self._setback = self._checkpoints()
         try:
             if kind.what == "killed":
                 victim.kill()
+            elif kind.what == FULL:
+                self._later(FULL_S, fill_disk(victim))
             else:
                 victim.suspend()
         except psutil.NoSuchProcess:
             return
         if kind.what == "delayed":
-            self._continue.append((time.monotonic() + DELAY_S, victim))
+            self._later(DELAY_S, victim.resume)
+
+    def _later(self, seconds: float, call: Callable[[], None]) -> None:
+        self._undo.append((time.monotonic() + seconds, call))
 
     def _note(self, kind: Kind, time_s: float) -> None:
         self.injected.append(Injected(kind, time_s))
@@ -180,12 +194,12 @@ class _ChaosRun:
     def _say(self, kind: Kind) -> None:
         self._console.print(f"{kind.victim} {kind.what}", highlight=False)
 
-    def _undo_delays(self) -> None:
-        due = [item for item in self._continue if item[0] <= time.monotonic()]
+    def _undo_what_passed(self) -> None:
+        due = [item for item in self._undo if item[0] <= time.monotonic()]
         for item in due:
-            self._continue.remove(item)
+            self._undo.remove(item)
             try:
-                item[1].resume()
+                item[1]()
             except psutil.NoSuchProcess:
                 continue
 
@@ -206,10 +220,10 @@ class _ChaosRun:
 
 
 def with_recovery(injected: list[Injected], log: list[FaultEntry]) -> list[Injected]:
-    """Each fault with the time until its part, or a part that replaced all, worked again; delays recover themselves."""
+    """Each fault with the time until its part, or a part that replaced all, worked again; what passes has none."""
     result = []
     for fault in injected:
-        if fault.kind.what == "delayed":
+        if fault.kind.what in PASSING:
             result.append(fault)
             continue
         ends = [entry.time_s for entry in log if entry.time_s > fault.time_s and _ends(fault.kind, entry)]
@@ -248,8 +262,9 @@ def chaos(command: Chaos) -> int:
         code = run.watch()
         faults = with_recovery(run.injected, read_faults(run.folder.faults)) + run.outages
         wrong = complaints(run.folder) if code == 0 else [f"exit code {code}:\n{run.driver.tail(30)}"]
+        learned = success(run.folder) if code == 0 else ""
     except TimeoutError as error:
-        faults, wrong = run.injected + run.outages, [str(error)]
+        faults, wrong, learned = run.injected + run.outages, [str(error)], ""
     finally:
         run.end()
     console.print(table(faults))
@@ -257,4 +272,5 @@ def chaos(command: Chaos) -> int:
         console.print(complaint, markup=False, highlight=False, soft_wrap=True)
     if not wrong:
         console.print(f"{len(faults)} faults; target reached, accounts balance, MLflow has every row once")
+        console.print(f"success rate {learned}", highlight=False)
     return 1 if wrong else 0

@@ -1,4 +1,4 @@
-"""The run that `shoal chaos` attacks: small, with two of everything that can be lost."""
+"""The run that `shoal chaos` attacks: small, with two of everything that can be lost, and with something to learn."""
 
 from __future__ import annotations
 
@@ -20,18 +20,21 @@ samples_per_insert = 1.0
 batch_size = 32
 updates_per_call = 4
 hidden_sizes = [32]
+epsilon_decay_env_steps = 30000
+learning_rate_decay_env_steps = {env_steps}
 n_step = 2
 target_update_interval = 50
 eval_every_env_steps = 4000
 eval_episodes = 50
-final_eval_episodes = 100
+final_eval_episodes = 1000
 log_every_env_steps = 2000
 checkpoint_every_env_steps = 8000
 
 [world]
 robots = 3
 groups = 2
-horizon_steps = 100
+arena_radius_m = 3.0
+horizon_steps = 400
 """
 
 

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from urllib.error import URLError
 from urllib.request import urlopen
@@ -93,17 +94,23 @@ class Driver:
 
     Args:
       log: the file.
+      environment: variables that it starts with beside ours.
     """
 
-    def __init__(self, log: Path) -> None:
+    def __init__(self, log: Path, environment: dict[str, str]) -> None:
         self._log = log
+        self._environment = os.environ | environment
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self, *arguments: str) -> None:
         """Starts `shoal` with these arguments."""
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "deploy", *arguments], stdout=log, stderr=log, start_new_session=True
+                [sys.executable, "-m", "deploy", *arguments],
+                stdout=log,
+                stderr=log,
+                env=self._environment,
+                start_new_session=True,
             )
 
     def exit_code(self) -> int | None:
@@ -144,6 +151,22 @@ class Driver:
     def tail(self, lines: int) -> str:
         """The end of its output."""
         return "\n".join(self._log.read_text(errors="replace").splitlines()[-lines:])
+
+
+def network_delay(delay_ms: float) -> dict[str, str]:
+    """What makes every message of Ray's late by 0 to `delay_ms`, each by another time; nothing for 0."""
+    return {"RAY_testing_asio_delay_us": f"*=0:{round(1000 * delay_ms)}"} if delay_ms else {}
+
+
+def fill_disk(process: psutil.Process) -> Callable[[], None]:
+    """Lets every write of a process to a file fail, as on a full disk; returns what lets it write again."""
+    limits = process.rlimit(psutil.RLIMIT_FSIZE)
+    process.rlimit(psutil.RLIMIT_FSIZE, (0, limits[1]))
+
+    def empty() -> None:
+        process.rlimit(psutil.RLIMIT_FSIZE, limits)
+
+    return empty
 
 
 def _children(pid: int) -> list[psutil.Process]:

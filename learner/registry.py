@@ -14,6 +14,7 @@ from mlflow import MlflowClient
 from mlflow.entities import Dataset, DatasetInput, InputTag
 from mlflow.entities.model_registry import ModelVersion
 from mlflow.exceptions import MlflowException
+from mlflow.models.model import ModelInfo
 from mlflow.protos.databricks_pb2 import RESOURCE_ALREADY_EXISTS, ErrorCode
 from mlflow.utils.mlflow_tags import MLFLOW_DATASET_CONTEXT
 
@@ -31,14 +32,14 @@ def model_name(config: RunConfig) -> str:
     return f"{world.method}-{world.robots}r-{world.groups}g" if config.env.is_swarm else config.env_id.replace("/", "-")
 
 
-def register_policy(client: MlflowClient, config: RunConfig, run_id: str, model_id: str, score: float) -> None:
+def register_policy(client: MlflowClient, config: RunConfig, run_id: str, logged: ModelInfo, score: float) -> None:
     """Makes a run's logged model a version of its setup's; one that the run has already stays as it is.
 
     Args:
       client: of the store.
       config: the run.
       run_id: its MLflow run.
-      model_id: of the logged model.
+      logged: the model.
       score: what versions are compared by.
     """
     name = model_name(config)
@@ -46,7 +47,8 @@ def register_policy(client: MlflowClient, config: RunConfig, run_id: str, model_
     versions: list[ModelVersion] = list(client.search_model_versions(f"name = '{name}'"))
     if all(version.run_id != run_id for version in versions):
         tags = {SCORE: repr(float(score)), "config_hash": config_hash(config), "seed": str(config.seed)}
-        versions.append(client.create_model_version(name, f"models:/{model_id}", run_id, tags, model_id=model_id))
+        made = client.create_model_version(name, logged.model_uri, run_id, tags, model_id=logged.model_id)
+        versions.append(made)
     ranked = [version for version in versions if SCORE in version.tags]
     best = max(ranked, key=lambda version: (float(version.tags[SCORE]), -int(version.version)))
     client.set_registered_model_alias(name, BEST, best.version)

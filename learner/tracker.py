@@ -200,7 +200,7 @@ class Tracker:
                 serialization_format="pt2",
                 pip_requirements=[f"torch=={torch.__version__.split('+')[0]}", f"numpy=={np.__version__}"],
             )
-        register_policy(self._client, config, self.run_id, logged.model_id, score)
+        register_policy(self._client, config, self.run_id, logged, score)
 
     def artifact(self, path: Path) -> None:
         """Uploads a file or a folder to the run's artifacts."""

@@ -1,12 +1,16 @@
 """What a chaos run says of its faults: who recovered when."""
 
 import io
+import subprocess
+import sys
 
+import psutil
 import pytest
 from rich.console import Console
 
-from deploy.chaos import KINDS, MLFLOW, Injected, Kind, table, with_recovery
+from deploy.chaos import FULL, KINDS, MLFLOW, Injected, Kind, table, with_recovery
 from deploy.chaos_config import write_config
+from deploy.chaos_processes import fill_disk, network_delay
 from deploy.cli import main, read_config_file
 from learner.fault_log import DRIVER, FaultEntry
 
@@ -67,6 +71,39 @@ def test_the_table_counts_faults_and_gives_median_and_maximum():
 def test_every_process_of_a_run_is_among_the_victims():
     killed = {kind.victim for kind in KINDS if kind.what == "killed"}
     assert killed == {"rollout worker", "replay shard", "evaluation", "learner", DRIVER, MLFLOW}
+    assert {kind.victim for kind in KINDS if kind.what == FULL} == {"rollout worker", "replay shard", "learner"}
+
+
+WRITER = """
+import pathlib, sys
+for line in sys.stdin:
+    try:
+        pathlib.Path(line.strip()).write_text("x")
+        print("written", flush=True)
+    except OSError as error:
+        print(type(error).__name__, flush=True)
+"""
+
+
+def test_a_process_whose_disk_is_full_gets_errors_until_it_is_not(tmp_path):
+    with subprocess.Popen(
+        [sys.executable, "-c", WRITER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as writer:
+
+        def write(name):
+            writer.stdin.write(f"{tmp_path / name}\n")
+            writer.stdin.flush()
+            return writer.stdout.readline().strip()
+
+        assert write("a") == "written"
+        empty = fill_disk(psutil.Process(writer.pid))
+        assert write("b") == "OSError"
+        empty()
+        assert write("c") == "written"
+
+
+def test_ray_is_told_of_the_networks_delay():
+    assert network_delay(2.5) == {"RAY_testing_asio_delay_us": "*=0:2500"} and network_delay(0) == {}
 
 
 def test_the_run_under_attack_has_two_of_everything_that_can_be_lost(tmp_path):
@@ -77,7 +114,14 @@ def test_the_run_under_attack_has_two_of_everything_that_can_be_lost(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("flag", "value"), [("--env-steps", "10"), ("--every-s", "0"), ("--deadline-s", "3"), ("--limit-s", "-1")]
+    ("flag", "value"),
+    [
+        ("--env-steps", "10"),
+        ("--every-s", "0"),
+        ("--deadline-s", "3"),
+        ("--network-delay-ms", "-1"),
+        ("--limit-s", "-1"),
+    ],
 )
 def test_what_cannot_be_is_refused(capsys, tmp_path, monkeypatch, flag, value):
     monkeypatch.chdir(tmp_path)
