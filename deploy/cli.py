@@ -21,7 +21,7 @@ from deploy.options import Chaos, Resume, Submit, Sweep, Train, ray_address  # n
 from deploy.result_options import Dashboard, Evaluate, Export, Report, Watch  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
 from learner.presets import PresetName, preset_config  # noqa: E402
-from learner.ray_auth import set_auth_mode  # noqa: E402
+from learner.ray_auth import guard_ray  # noqa: E402
 from sim_core.checks import ConfigError, require  # noqa: E402
 from sim_core.config import MethodName  # noqa: E402
 
@@ -129,7 +129,7 @@ def _joins_cluster(command: Command) -> bool:
 
 def execute(command: Command) -> int:
     """Runs a command; returns its exit code. Imports are late: help must not wait for Ray and MLflow."""
-    set_auth_mode(_joins_cluster(command))  # which Ray reads when it is imported
+    guard_ray(_joins_cluster(command))  # which Ray reads when it is imported
     if isinstance(command, Train | Resume):
         from deploy import training
 

@@ -1,15 +1,21 @@
-"""How this process shows itself to a Ray cluster: with a token, or not at all.
+"""Who may speak to the Ray that a process starts or joins: tokens, and the loopback interface.
 
-Ray decides by RAY_AUTH_MODE. Where it is not set, `ray start` asks for a token if its user has one, and so do we: a
+Ray decides by environment variables that it reads when it is imported. A Ray of our own listens on loopback alone and
+asks for a token that only this process and its children have: neither the network nor another user of the machine can
+make it run code. For a cluster that is joined, `ray start` asks for a token if its user has one, and so do we: a
 process that asked for a token and has none would be refused before it has spoken to anybody.
 """
 
 from __future__ import annotations
 
 import os
+import secrets
 from pathlib import Path
 
 MODE = "RAY_AUTH_MODE"
+TOKEN = "RAY_AUTH_TOKEN"
+REMOTE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+"""Whether Ray takes an address that others can reach, on any system in spite of its name; "0" is loopback alone."""
 HOW = (
     "set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH to the cluster's token "
     "(`ray get-auth-token` prints it there)"
@@ -20,13 +26,18 @@ def has_token() -> bool:
     """Whether Ray would find a token: in RAY_AUTH_TOKEN, in the file RAY_AUTH_TOKEN_PATH, or in ~/.ray/auth_token."""
     path = os.environ.get("RAY_AUTH_TOKEN_PATH")
     file = Path(path) if path else Path.home() / ".ray" / "auth_token"
-    return bool(os.environ.get("RAY_AUTH_TOKEN")) or file.is_file()
+    return bool(os.environ.get(TOKEN)) or file.is_file()
 
 
-def set_auth_mode(joins: bool) -> None:
-    """Sets RAY_AUTH_MODE where it is not set; before Ray is imported, which reads it then.
+def guard_ray(joins: bool) -> None:
+    """Sets what of these variables is not set; before Ray is imported.
 
     Args:
       joins: whether a cluster is joined that others can reach, rather than a Ray of our own started.
     """
-    os.environ.setdefault(MODE, "token" if joins and has_token() else "disabled")
+    if joins:
+        os.environ.setdefault(MODE, "token" if has_token() else "disabled")
+        return
+    os.environ.setdefault(REMOTE, "0")
+    if os.environ.setdefault(MODE, "token") == "token" and not has_token():
+        os.environ[TOKEN] = secrets.token_hex(32)

@@ -37,7 +37,7 @@ from learner.cluster import Cluster, learner_settings, rollout_settings, shard_s
 from learner.config import RunConfig
 from learner.node import LearnerNode
 from learner.place import DEADLINE_S, Place
-from learner.ray_auth import HOW, set_auth_mode
+from learner.ray_auth import HOW, guard_ray
 from sim_core.checks import ConfigError, require
 
 PUSHES_IN_FLIGHT = 1
@@ -170,7 +170,7 @@ def connect(cpus: int, address: str | None) -> None:
     """
     if ray.is_initialized():
         return  # an earlier attempt of this run has joined
-    set_auth_mode(address is not None)
+    guard_ray(address is not None)
     os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # of calls to parts that have been replaced
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     options: dict[str, Any] = {"address": address}

@@ -38,6 +38,12 @@ class Job:
     def wait_for_checkpoints(self, run: str, count: int) -> None:
         self.wait_for_files(f"runs/{run}/checkpoints/step-*", count)
 
+    def listening(self) -> set[str]:
+        """Addresses on which the driver and its processes take connections."""
+        driver = psutil.Process(self.process.pid)
+        sockets = [each for process in [driver, *driver.children(recursive=True)] for each in process.net_connections()]
+        return {each.laddr.ip.removeprefix("::ffff:") for each in sockets if each.status == psutil.CONN_LISTEN}
+
     def kill_all(self) -> None:
         """SIGKILL for the driver and every process that it started."""
         driver = psutil.Process(self.process.pid)

@@ -102,6 +102,7 @@ def test_kill_9_of_the_whole_job_costs_only_what_came_after_the_last_checkpoint(
     job = Job(tmp_path, "train", "--name", "r", *flags(LONG))
     try:
         job.wait_for_checkpoints("r", 3)
+        assert job.listening() == {"127.0.0.1"}, "a Ray of our own is for nobody else"
     finally:
         job.kill_all()
     _, run = the_run(tmp_path)

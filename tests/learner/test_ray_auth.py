@@ -1,22 +1,22 @@
-"""Whether a process shows a token to Ray."""
+"""Who may speak to the Ray that a process starts or joins."""
 
 import os
 
 import pytest
 
-from learner.ray_auth import set_auth_mode
+from learner.ray_auth import REMOTE, guard_ray
 
 
 @pytest.fixture(autouse=True)
 def nothing_set(monkeypatch, tmp_path):
-    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
+    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", REMOTE):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
     monkeypatch.setenv("HOME", str(tmp_path))
 
 
 def mode(joins: bool) -> str:
-    set_auth_mode(joins)
+    guard_ray(joins)
     return os.environ["RAY_AUTH_MODE"]
 
 
@@ -24,9 +24,21 @@ def test_without_a_token_none_is_shown():
     assert mode(joins=True) == "disabled"
 
 
-def test_a_ray_of_our_own_asks_for_none(monkeypatch):
+def test_a_ray_of_our_own_keeps_to_loopback_and_asks_for_a_token_of_its_own():
+    assert mode(joins=False) == "token" and os.environ[REMOTE] == "0"
+    token = os.environ["RAY_AUTH_TOKEN"]
+    assert len(token) == 64
+    assert mode(joins=False) == "token" and os.environ["RAY_AUTH_TOKEN"] == token, "made once"
+
+
+def test_a_ray_of_our_own_asks_for_the_users_token(monkeypatch):
     monkeypatch.setenv("RAY_AUTH_TOKEN", "a")
-    assert mode(joins=False) == "disabled"
+    assert mode(joins=False) == "token" and os.environ["RAY_AUTH_TOKEN"] == "a"
+
+
+def test_a_cluster_is_joined_by_its_own_address():
+    mode(joins=True)
+    assert REMOTE not in os.environ and "RAY_AUTH_TOKEN" not in os.environ
 
 
 @pytest.mark.parametrize("where", ["variable", "file", "home"])
