@@ -129,11 +129,8 @@ class TrainingLoop:
             if self._progress.is_due("log"):
                 self._write_row(self._progress.row())
             self._tend_checkpoints()  # a snapshot while nothing is under way; it is written meanwhile
-        finished = self.env_steps >= self._config.total_env_steps
-        if finished and self._progress.is_due("eval"):
-            self._start_evaluation()  # the last one, or one that a checkpoint kept waiting
         self._save_the_end()
-        return finished
+        return self.env_steps >= self._config.total_env_steps
 
     def _send_first_weights(self) -> None:
         self._weights = self._mender.ask(LEARNER, "weights")[0]

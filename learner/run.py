@@ -180,7 +180,7 @@ def execute(
         result, rows = _train(folder, config, tracker, display, checkpoint, place)
         if result.evaluation is not None:
             patience_s = tracker.patience_s
-            time_ms = rows[-1].time_ms if rows else tracker.started_ms
+            time_ms = _time_of_results(result, rows, tracker)
             metrics = as_metrics(result.evaluation)
             insist(lambda: tracker.final(metrics, time_ms), "the results", patience_s, say)
             insist(lambda: finish(result, rows), "the artifacts", patience_s, say)
@@ -196,6 +196,12 @@ def execute(
 def _without_secrets(display: Display, tracker: Tracker) -> Callable[[str], None]:
     """Shows what is said of MLflow, whose errors name its address, to a person."""
     return lambda text: display.message(hide_secrets(text, tracker.uri))
+
+
+def _time_of_results(result: RunResult, rows: list[Row], tracker: Tracker) -> int:
+    """The same for the same results, which are stored once however often they are sent, and another for later ones."""
+    since = rows[-1].time_ms if rows else tracker.started_ms
+    return since + result.env_steps - (rows[-1].env_steps if rows else 0)
 
 
 def _end(tracker: Tracker, status: str, say: Callable[[str], None]) -> None:
