@@ -18,6 +18,12 @@ class Estimate(NamedTuple):
     high: float
 
 
+def as_percent(share: Estimate) -> str:
+    """`89.8 % (87.8 … 91.5)`."""
+    value, low, high = (100 * number for number in share)
+    return f"{value:.1f} % ({low:.1f} … {high:.1f})"
+
+
 def rate(count: int, total: int) -> Estimate:
     """Share of successes with its Wilson interval (Wilson 1927).
 

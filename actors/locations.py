@@ -72,7 +72,7 @@ def filesystem(url: str) -> tuple[Any, str]:
     except (ImportError, ValueError) as error:
         raise ConfigError(
             f"{url} cannot be opened ({error}); s3:// needs `pip install 'shoal[s3]'`, other protocols their fsspec "
-            f"package, and {', '.join(('file', 's3', 'memory'))} are tested"
+            "package, and file, s3, memory are tested"
         ) from error
     return found
 

@@ -93,8 +93,13 @@ def file_sum(path: Path) -> FileSum:
 def sync_all(path: Path) -> None:
     """Makes a file, or a folder with all in it, durable; the folder around it is the caller's to sync."""
     for each in [path, *path.rglob("*")] if path.is_dir() else [path]:
-        descriptor = os.open(each, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        sync(each)
+
+
+def sync(path: Path) -> None:
+    """Makes a file's content, or a folder's list of names, durable."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from actors.estimates import Estimate
+from actors.estimates import as_percent
 from dashboards.pooled import Measured
 
 Figure = dict[str, Any]
@@ -77,13 +77,7 @@ def as_json(chart: Chart) -> dict[str, Any]:
 
 def percent_text(measured: Measured | None) -> str:
     """`89.8 % (87.8 … 91.5)`, `–` without data."""
-    return "–" if measured is None else estimate_text(measured.estimate)
-
-
-def estimate_text(estimate: Estimate) -> str:
-    """`89.8 % (87.8 … 91.5)`."""
-    value, low, high = (100 * number for number in estimate)
-    return f"{value:.1f} % ({low:.1f} … {high:.1f})"
+    return "–" if measured is None else as_percent(measured.estimate)
 
 
 def layout(**changes: Any) -> dict[str, Any]:

@@ -20,7 +20,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from actors.estimates import Estimate
+from actors.estimates import Estimate, as_percent
 from dashboards.pooled import Measured, Setup
 
 ABOUT = 0.10
@@ -122,12 +122,6 @@ def alike(name: str, measured: Measured | None) -> Check:
 
 def _plain(share: float) -> str:
     return f"{100 * share:g}"
-
-
-def as_percent(estimate: Estimate) -> str:
-    """`89.8 % (87.8 … 91.5)`."""
-    value, low, high = (100 * number for number in estimate)
-    return f"{value:.1f} % ({low:.1f} … {high:.1f})"
 
 
 def as_points(estimate: Estimate) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 from plotly.colors import sample_colorscale
 
+from actors.estimates import as_percent
 from actors.result_table import GROUPS, ROBOTS
 from dashboards.chart import (
     FAILURES,
@@ -17,7 +18,6 @@ from dashboards.chart import (
     Table,
     View,
     error_bars,
-    estimate_text,
     layout,
     patterned,
     percent_text,
@@ -173,7 +173,7 @@ def _bars(name: str, rates: Mapping[Setup, Measured | None], colour: str, patter
         "x": [str(setup) for setup in found],
         "y": [rate.estimate.value for rate in found.values()],
         "error_y": error_bars(list(found.values())),
-        "customdata": [estimate_text(rate.estimate) for rate in found.values()],
+        "customdata": [as_percent(rate.estimate) for rate in found.values()],
         "hovertemplate": "%{x}: %{customdata}<extra>" + name + "</extra>",
         "marker": patterned(colour, pattern),
     }
@@ -215,7 +215,7 @@ def _failure_figure(shares: Mapping[Setup, Mapping[str, Measured]], y_axis: dict
     places = [[f"{setup.robots} robots" for setup in shares], [f"{setup.groups}g" for setup in shares]]
     for cause, (colour, pattern, _, _) in FAILURES.items():
         rates = [row[cause] for row in shares.values()]
-        texts = [[str(setup), estimate_text(rate.estimate)] for setup, rate in zip(shares, rates, strict=True)]
+        texts = [[str(setup), as_percent(rate.estimate)] for setup, rate in zip(shares, rates, strict=True)]
         bars.append(
             {
                 "type": "bar",

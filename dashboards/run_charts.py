@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from statistics import median
 from typing import NamedTuple
 
-from actors.estimates import Estimate
+from actors.estimates import Estimate, as_percent
 from dashboards.chart import (
     FAILURES,
     METHOD_COLOURS,
@@ -17,7 +17,6 @@ from dashboards.chart import (
     Panel,
     Table,
     View,
-    estimate_text,
     layout,
     share_axis,
 )
@@ -117,7 +116,7 @@ def _curve_traces(training: Training) -> list[dict[str, object]]:
 
 def _value_text(point: CurvePoint, is_share: bool) -> str:
     if is_share:
-        return estimate_text(Estimate(point.value, point.low, point.high))
+        return as_percent(Estimate(point.value, point.low, point.high))
     return f"{point.value:.2f} ({point.low:.2f} … {point.high:.2f})"
 
 

@@ -6,6 +6,7 @@ from contextlib import closing
 
 import mlflow
 
+from actors.estimates import Estimate, as_percent
 from learner.journal import ACCOUNT, FINAL, Journal, Row, charted
 from learner.run import resume_point
 from learner.run_folder import RunFolder
@@ -15,8 +16,7 @@ def success(folder: RunFolder) -> str:
     """What the run learned: its success rate at the end with the interval, from MLflow, whose server must run."""
     identity = folder.identity()
     metrics = mlflow.MlflowClient(identity.tracking_uri).get_run(identity.mlflow_run_id).data.metrics
-    rate, low, high = (100 * metrics[f"{FINAL}success_rate{end}"] for end in ("", "_low", "_high"))
-    return f"{rate:.1f} % ({low:.1f} … {high:.1f})"
+    return as_percent(Estimate(*(metrics[f"{FINAL}success_rate{end}"] for end in ("", "_low", "_high"))))
 
 
 def complaints(folder: RunFolder) -> list[str]:

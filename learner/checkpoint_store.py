@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple, Protocol
 
 from actors.locations import Location, filesystem, storage_errors
-from actors.parts import sync_all
+from actors.parts import sync
 from learner.manifest import MANIFEST
 
 PREFIX = "step-"
@@ -121,15 +121,15 @@ class FolderStore:
         assert isinstance(draft, Path)
         for name, content in last.items():
             (draft / name).write_bytes(content)
-            sync_all(draft / name)
-        sync_folder(draft)
+            sync(draft / name)
+        sync(draft)
         final = self._root / draft.name.split(".")[0]
         old = final.with_name(final.name + ".old")
         if final.exists():
             shutil.rmtree(old, ignore_errors=True)
             final.rename(old)  # after a crash between here and the next line it still counts
         draft.rename(final)
-        sync_folder(self._root)
+        sync(self._root)
         shutil.rmtree(old, ignore_errors=True)
         return final.name
 
@@ -139,15 +139,6 @@ class FolderStore:
         left = [path for path in self._root.glob(f"{PREFIX}*") if OURS.match(path.name) and path.name not in finished]
         for path in [*left, *(self._root / name for name in names)]:
             shutil.rmtree(path, ignore_errors=True)
-
-
-def sync_folder(folder: Path) -> None:
-    """Makes a folder's list of names durable."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 class UrlStore:

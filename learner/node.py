@@ -184,8 +184,7 @@ class LearnerNode:
         tensors = self._learner.get_state()
         self._writer.start(inside(folder, WEIGHTS), lambda path: save_file(tensors, str(path)))
         refs = [
-            self._shard_calls.start(shard, "save", inside(folder, f"shard-{i}.zarr"))
-            for i, shard in enumerate(self._shards)
+            self._shard_calls.start(shard, "save", _shard_folder(folder, i)) for i, shard in enumerate(self._shards)
         ]
         shards = [self._result(i, ref) for i, ref in enumerate(refs)]
         return {"shards": shards, "rng": self._rng.bit_generator.state, "sizes": self._masses.tolist()}
@@ -223,7 +222,7 @@ class LearnerNode:
         if len(state["shards"]) != len(self._shards):
             raise ValueError(f"the checkpoint has {len(state['shards'])} shards, this run {len(self._shards)}")
         refs = [
-            self._shard_calls.start(shard, "load", inside(folder, f"shard-{i}.zarr"), shard_state)
+            self._shard_calls.start(shard, "load", _shard_folder(folder, i), shard_state)
             for i, (shard, shard_state) in enumerate(zip(self._shards, state["shards"], strict=True))
         ]
         for i, ref in enumerate(refs):
@@ -236,3 +235,7 @@ class LearnerNode:
     def weights(self) -> list[Ref]:
         """A reference to the newest weights, in a list."""
         return [self._weights]
+
+
+def _shard_folder(folder: Location, shard: int) -> Location:
+    return inside(folder, f"shard-{shard}.zarr")

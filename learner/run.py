@@ -200,8 +200,8 @@ def _without_secrets(display: Display, tracker: Tracker) -> Callable[[str], None
 
 def _time_of_results(result: RunResult, rows: list[Row], tracker: Tracker) -> int:
     """The same for the same results, which are stored once however often they are sent, and another for later ones."""
-    since = rows[-1].time_ms if rows else tracker.started_ms
-    return since + result.env_steps - (rows[-1].env_steps if rows else 0)
+    last = rows[-1] if rows else Row(0, tracker.started_ms, {})
+    return last.time_ms + result.env_steps - last.env_steps
 
 
 def _end(tracker: Tracker, status: str, say: Callable[[str], None]) -> None:

@@ -11,6 +11,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -102,6 +103,10 @@ class Tracker:
         """How long to try what the store does not take: a server may come back, a file does not."""
         return PATIENCE_S if self.uri.startswith(("http:", "https:")) else 0.0
 
+    @cached_property
+    def _commit(self) -> str:
+        return git_commit()
+
     def start(self, config: RunConfig, tags: dict[str, str] | None = None) -> None:
         """Creates the run, with the whole config as params and, with `tags`, what a user filters by as tags."""
         known = {
@@ -111,7 +116,7 @@ class Tracker:
             "seed": str(config.seed),
             "engine": config.engine,
             "config_hash": config_hash(config),
-            "mlflow.source.git.commit": git_commit(),
+            "mlflow.source.git.commit": self._commit,
         }
         run = self._client.create_run(self._experiment_id, tags={"mlflow.runName": config.name} | known | (tags or {}))
         self.run_id, self.started_ms = run.info.run_id, run.info.start_time
@@ -121,7 +126,7 @@ class Tracker:
         """Logs the whole config and the episodes it names; what the run has already must be the same."""
         params = [Param(key, str(value)) for key, value in flat_params(config).items()]
         self._client.log_batch(self.run_id, params=params)
-        self._client.log_inputs(self.run_id, datasets=dataset_inputs(config, git_commit()))
+        self._client.log_inputs(self.run_id, datasets=dataset_inputs(config, self._commit))
 
     def find_run(self, tags: dict[str, str]) -> str | None:
         """Id of the experiment's oldest run that has all `tags`; None if there is none."""
@@ -216,7 +221,7 @@ class Tracker:
             try:
                 self._client.set_experiment_tag(self._experiment_id, TAG + key, packed_view(name, state, now_ms))
             except MlflowException as error:
-                logging.getLogger(__name__).warning("no MLflow view %r: %s", name, str(error).splitlines()[0])
+                logging.getLogger(__name__).warning("no MLflow view %r: %s", name, first_line(error))
 
     @contextmanager
     def ending(self) -> Iterator[None]:

@@ -1,7 +1,5 @@
 """Rollout nodes and shard nodes: pushes, replies, reports and state."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -11,19 +9,10 @@ from actors.nodes import RolloutNode, ShardNode, ShardSettings
 from actors.rollout import RolloutSettings, RolloutWorker
 from actors.transitions import Delivered, Dropped, transition_dtype
 from actors.vector_env import env_shape
+from tests.checkpointing import saved
 
 NUM_ENVS, STEPS = 2, 8
 BLOCK = NUM_ENVS * STEPS
-
-
-def saved(node, location):
-    """Has a node save itself and waits for the end; its state."""
-    state, deadline_s = node.save(location), time.monotonic() + 60
-    while (written := node.saved()) is None:
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
-    assert written.error is None and written.files
-    return state
 
 
 class Later:

@@ -21,6 +21,7 @@ from learner.loop import TrainingLoop
 from learner.place import Place
 from learner.ray_edge import ray_cluster
 from tests.benchmarks.timing import rates, ratio, spread
+from tests.checkpointing import Silent
 
 ROUNDS = 5
 SERVICE_S = 30.0
@@ -62,17 +63,6 @@ def learner_work(config: RunConfig):
         return 4 * config.updates_per_call
 
     return work
-
-
-class Silent:
-    def row(self, row) -> None:
-        pass
-
-    def checkpoint(self, folder, journal_offset) -> None:
-        pass
-
-    def checkpoint_failed(self, env_steps, reason) -> None:
-        raise RuntimeError(reason)
 
 
 def service_rates(config: RunConfig) -> tuple[float, float]:

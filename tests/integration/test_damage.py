@@ -11,20 +11,10 @@ from learner.checkpoint import newest_valid
 from learner.cluster import process_cluster
 from learner.journal import Journal
 from learner.loop import TrainingLoop
+from tests.checkpointing import Silent
 from tests.integration.conftest import SMALL
 
 PLACES = 240
-
-
-class Silent:
-    def row(self, row):
-        pass
-
-    def checkpoint(self, folder, journal_offset):
-        pass
-
-    def checkpoint_failed(self, env_steps, reason):
-        raise AssertionError(reason)
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ from learner.checkpoint import newest_valid
 from learner.cluster import process_cluster
 from learner.journal import Journal
 from learner.loop import TrainingLoop
+from tests.checkpointing import Silent
 from tests.integration.conftest import flags
 from tests.integration.jobs import Job
 
@@ -30,17 +31,6 @@ OPTIONS = {
     "target_update": "soft",
     "learning_rate_schedule": "cosine",
 }
-
-
-class Silent:
-    def row(self, row):
-        pass
-
-    def checkpoint(self, folder, journal_offset):
-        pass
-
-    def checkpoint_failed(self, env_steps, reason):
-        raise AssertionError(reason)
 
 
 class Listing(Silent):

@@ -12,21 +12,9 @@ from learner.config import RunConfig
 from learner.journal import Journal
 from learner.loop import TrainingLoop
 from learner.metric_names import ENV_STEPS, METRICS
+from tests.checkpointing import Silent
 
 PAGE = Path(__file__).parents[2] / "deploy" / "README.md"
-
-
-class Silent:
-    """Watches nothing; implements `learner.loop.Observer`."""
-
-    def row(self, row):
-        pass
-
-    def checkpoint(self, folder, journal_offset):
-        pass
-
-    def checkpoint_failed(self, env_steps, reason):
-        raise AssertionError(reason)
 
 
 def journal_names(config: RunConfig, folder: Path) -> set[str]:

@@ -1,7 +1,6 @@
 """The learner's node: sampling over shards, publication, state; and one contract for both placements of a shard."""
 
 import json
-import time
 
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock
 from learner.double_dqn import importance_weights
 from learner.learner import Learner
 from learner.node import LearnerNode
+from tests.checkpointing import saved
 
 RATE = 1e-3
 
@@ -23,16 +23,6 @@ RATE = 1e-3
 def make_block(rows, sequence=0, worker_id=0, incarnation=0, version=0, schema=SCHEMA_VERSION):
     header = BlockHeader(schema, worker_id, incarnation, sequence, version, 0.0, 0.0, len(rows))
     return TransitionBlock(header, rows, join_stats([]))
-
-
-def saved(node, location):
-    """Has a node save itself and waits for the end; its state."""
-    state, deadline_s = node.save(location), time.monotonic() + 60
-    while (written := node.saved()) is None:
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
-    assert written.error is None and written.files
-    return state
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """Reading a policy from a checkpoint."""
 
 import dataclasses
-import time
 
 import numpy as np
 import pytest
@@ -13,12 +12,11 @@ from learner.config import RunConfig
 from learner.manifest import CheckpointError
 from learner.policy_file import read_policy, read_saved_policy, save_policy
 from sim_core.config import WorldConfig
+from tests import checkpointing
 
 
 def checkpoint_of(learner, folder):
-    learner.save(folder)
-    while learner.saved() is None:
-        time.sleep(0.005)
+    checkpointing.saved(learner, folder)
     return Checkpoint(folder, {"updates": 42})
 
 
