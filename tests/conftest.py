@@ -1,9 +1,13 @@
-"""A real S3 server (moto's) for all tests that need one."""
+"""What all tests share: a process that any of them may start Ray in, and a real S3 server (moto's)."""
 
 import os
 from collections.abc import Iterator
 
 import pytest
+
+from learner.ray_auth import guard_ray
+
+guard_ray(joins=False)  # as `shoal` does: Ray reads this once, when the first test module imports it
 
 BUCKET = "shoal-tests"
 

@@ -61,9 +61,8 @@ def shoal(tmp_path: Path):
 
 
 def clean_environment() -> dict[str, str]:
-    """This process's environment without what would redirect a run."""
-    drop = ("MLFLOW_TRACKING_URI", "RAY_ADDRESS")
-    return {name: value for name, value in os.environ.items() if name not in drop}
+    """This process's environment without what would redirect a run or let it into this process's own Ray."""
+    return {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "MLFLOW_TRACKING"))}
 
 
 def flags(config: RunConfig) -> list[str]:

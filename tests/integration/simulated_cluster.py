@@ -5,12 +5,13 @@ with the table of Ray actors, and ends the nodes with its input.
 """
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+
+from tests.integration.conftest import clean_environment
 
 NODES = 3
 CPUS = 2
@@ -24,7 +25,7 @@ class SimulatedCluster:
     def __init__(self) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix="shoal-", dir="/tmp"))  # Ray's sockets want a short path
         self.environment = {
-            **{name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "MLFLOW_TRACKING"))},
+            **clean_environment(),
             "RAY_AUTH_MODE": "token",
             "RAY_AUTH_TOKEN": TOKEN,
             "RAY_TMPDIR": str(self.folder),

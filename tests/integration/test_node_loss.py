@@ -1,7 +1,6 @@
 """A node of a Ray cluster is removed while a run trains: what it held is placed anew and the accounts balance."""
 
 import dataclasses
-import os
 
 import pytest
 import ray
@@ -41,8 +40,7 @@ class NodeRemover:
 
 
 @pytest.fixture
-def cluster(monkeypatch):
-    monkeypatch.setitem(os.environ, "RAY_AUTH_MODE", "disabled")
+def cluster():
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "_system_config": QUICK})
     yield made
     ray.shutdown()

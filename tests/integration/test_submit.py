@@ -1,7 +1,6 @@
 """`shoal submit` on a real Ray of one node: Ctrl-C saves a checkpoint, the same command goes on from it."""
 
 import dataclasses
-import os
 import re
 import signal
 import subprocess
@@ -13,7 +12,7 @@ import mlflow
 import pytest
 
 from learner.checkpoint import newest_valid
-from tests.integration.conftest import SMALL
+from tests.integration.conftest import SMALL, clean_environment
 from tests.integration.ray_head import Head, copy_of_the_code, finish, running_head, submit, wait_for
 
 pytestmark = [
@@ -98,7 +97,7 @@ def test_ray_job_submit_runs_a_sweep(head, checkout, tmp_path):
         [f"{Path(sys.executable).parent}/ray", "job", "submit", "--address", head.address, "--working-dir", "."]
         + ["--", "shoal", *words],
         cwd=checkout,
-        env={**os.environ, "RAY_AUTH_MODE": "disabled"},
+        env={**clean_environment(), "RAY_AUTH_MODE": "disabled"},
         capture_output=True,
         text=True,
         timeout=800,
