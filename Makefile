@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: train test bench bench-exactness fuzz lint setup clean
+.PHONY: train test bench bench-exactness fuzz soak lint setup clean
 
 setup: $(READY)
 
@@ -39,6 +39,10 @@ bench-exactness: $(READY)
 # Over ten thousand random command lines and config files. ARGS="--share 0.1" for some, ARGS="--seed 1" for others.
 fuzz: $(READY)
 	$(BIN)/python -m tests.benchmarks.fuzz $(ARGS)
+
+# Two hours of training at full speed: is memory flat, does anything leak? ARGS="--hours 0.1" for a short one.
+soak: $(READY)
+	$(BIN)/python -m tests.benchmarks.soak $(ARGS)
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -10,7 +10,10 @@ from __future__ import annotations
 
 import os
 import secrets
+import sys
 from pathlib import Path
+
+from sim_core.checks import require
 
 MODE = "RAY_AUTH_MODE"
 TOKEN = "RAY_AUTH_TOKEN"
@@ -34,10 +37,18 @@ def guard_ray(joins: bool) -> None:
 
     Args:
       joins: whether a cluster is joined that others can reach, rather than a Ray of our own started.
+
+    Raises:
+      ConfigError: a Ray of our own could not be guarded, as Ray has been imported and nothing is set.
     """
     if joins:
         os.environ.setdefault(MODE, "token" if has_token() else "disabled")
         return
+    require(
+        MODE in os.environ or "ray" not in sys.modules,
+        "Ray was imported before it was decided who may speak to it; call learner.ray_auth.guard_ray first, or set "
+        f"{MODE} and {TOKEN}",
+    )
     os.environ.setdefault(REMOTE, "0")
     if os.environ.setdefault(MODE, "token") == "token" and not has_token():
         os.environ[TOKEN] = secrets.token_hex(32)

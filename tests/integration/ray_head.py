@@ -6,7 +6,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -60,13 +60,17 @@ def wait_for(condition, log, process: subprocess.Popen) -> None:
         time.sleep(0.2)
 
 
-def ray_start(log: Path, *words: str) -> subprocess.Popen:
-    """`ray start --block` on this machine alone, once it has started or ended."""
+LOOPBACK = ("--node-ip-address=127.0.0.1",)
+NO_TOKEN = {"RAY_AUTH_MODE": "disabled"}
+
+
+def ray_start(log: Path, *words: str, auth: dict[str, str], before: Sequence[str] = ()) -> subprocess.Popen:
+    """`ray start --block`, with the words `before` in front of it, once it has started or ended."""
     binaries = str(Path(sys.executable).parent)
-    environment = {**clean_environment(), "RAY_AUTH_MODE": "disabled"}
+    environment = {**clean_environment(), **auth}
     environment["PATH"] = f"{binaries}:{environment['PATH']}"
     environment.pop("PYTHONPATH", None)  # a job's code is what was uploaded
-    command = [f"{binaries}/ray", "start", "--block", "--disable-usage-stats", "--node-ip-address=127.0.0.1", *words]
+    command = [*before, f"{binaries}/ray", "start", "--block", "--disable-usage-stats", *words]
     with log.open("w") as file:
         process = subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
     while process.poll() is None and "Ray runtime started" not in log.read_text():
@@ -85,8 +89,8 @@ def as_flags(ports: dict[str, int]) -> list[str]:
 def start_head(folder: Path, log: Path, *words: str) -> tuple[subprocess.Popen, dict[str, int]]:
     """(`ray start --head`, as a user starts it on a laptop, and its ports)."""
     ports = with_free_ports(*HEAD_PORTS, *NODE_PORTS)
-    words = ("--head", "--dashboard-host=127.0.0.1", f"--temp-dir={folder}", *words)
-    return ray_start(log, *words, *as_flags(ports)), ports
+    words = ("--head", "--dashboard-host=127.0.0.1", *LOOPBACK, f"--temp-dir={folder}", *words)
+    return ray_start(log, *words, *as_flags(ports), auth=NO_TOKEN), ports
 
 
 def end(process: subprocess.Popen) -> None:
@@ -121,7 +125,8 @@ def joined_node(head: Head, log: Path, *words: str) -> Iterator[subprocess.Popen
     """Another node of the head's cluster, with a folder of its own: in a shared one, nodes delete each other's code."""
     folder = Path(tempfile.mkdtemp(prefix="sh", dir="/tmp"))
     ports = with_free_ports(*NODE_PORTS)
-    node = ray_start(log, f"--address={head.gcs}", f"--temp-dir={folder}", *words, *as_flags(ports))
+    words = (f"--address={head.gcs}", *LOOPBACK, f"--temp-dir={folder}", *words)
+    node = ray_start(log, *words, *as_flags(ports), auth=NO_TOKEN)
     assert node.poll() is None, log.read_text()
     try:
         yield node
@@ -164,7 +169,7 @@ def submit(head: Head, checkout: Path, config: RunConfig, runs: Path, log: Path,
         return subprocess.Popen(
             [sys.executable, "-W", "error::DeprecationWarning:__main__", "-m", "deploy", *words],
             cwd=checkout,
-            env={**clean_environment(), "RAY_AUTH_MODE": "disabled", "PYTHONPATH": str(checkout)},
+            env={**clean_environment(), **NO_TOKEN, "PYTHONPATH": str(checkout)},
             stdout=file,
             stderr=subprocess.STDOUT,
         )

@@ -13,7 +13,7 @@ import pytest
 
 from learner.checkpoint import newest_valid
 from tests.integration.conftest import SMALL, clean_environment
-from tests.integration.ray_head import Head, copy_of_the_code, finish, running_head, submit, wait_for
+from tests.integration.ray_head import NO_TOKEN, Head, copy_of_the_code, finish, running_head, submit, wait_for
 
 pytestmark = [
     pytest.mark.ray,
@@ -97,7 +97,7 @@ def test_ray_job_submit_runs_a_sweep(head, checkout, tmp_path):
         [f"{Path(sys.executable).parent}/ray", "job", "submit", "--address", head.address, "--working-dir", "."]
         + ["--", "shoal", *words],
         cwd=checkout,
-        env={**clean_environment(), "RAY_AUTH_MODE": "disabled"},
+        env={**clean_environment(), **NO_TOKEN},
         capture_output=True,
         text=True,
         timeout=800,

@@ -1,10 +1,12 @@
 """Who may speak to the Ray that a process starts or joins."""
 
 import os
+import sys
 
 import pytest
 
 from learner.ray_auth import REMOTE, guard_ray
+from sim_core.checks import ConfigError
 
 
 @pytest.fixture(autouse=True)
@@ -13,6 +15,7 @@ def nothing_set(monkeypatch, tmp_path):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
     monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delitem(sys.modules, "ray", raising=False)
 
 
 def mode(joins: bool) -> str:
@@ -58,3 +61,10 @@ def test_what_the_user_has_set_stays(monkeypatch):
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("RAY_AUTH_TOKEN", "a")
     assert mode(joins=True) == "disabled"
+
+
+def test_a_ray_that_was_imported_unguarded_is_not_started(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", object())
+    with pytest.raises(ConfigError, match=r"guard_ray first, or set RAY_AUTH_MODE and RAY_AUTH_TOKEN"):
+        guard_ray(joins=False)
+    assert REMOTE not in os.environ
