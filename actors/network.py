@@ -114,7 +114,7 @@ def load_snapshot(network: QNetwork, weights: WeightsSnapshot) -> None:
         raise ValueError("the saved weights are of a network of another shape")
     with torch.no_grad():
         for parameter, array in zip(parameters, weights.arrays, strict=True):
-            parameter.copy_(torch.from_numpy(array))
+            parameter.copy_(torch.tensor(array))  # a copy: what Ray gives cannot be written to
 
 
 class Policy:

@@ -95,6 +95,8 @@ def test_snapshot_round_trip_and_copies():
     weights = snapshot(network, 17, 4.5)
     assert (weights.version, weights.time_s) == (17, 4.5)
     other = make_network(6, (5, 4), 3, seed=9)
+    for array in weights.arrays:
+        array.flags.writeable = False  # as Ray gives them
     load_snapshot(other, weights)
     again = snapshot(other, 17, 4.5)
     for first, second in zip(weights.arrays, again.arrays, strict=True):

@@ -1,7 +1,6 @@
 """The client of Ray's job server, beside servers of our own that refuse, break off, or are not there."""
 
 import asyncio
-import os
 import socket
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from aiohttp import web
 
 from deploy.jobs import JobServer
 from sim_core.checks import ConfigError
+from tests.integration.conftest import clean_environment
 
 ROOT = Path(__file__).parents[2]
 TOKEN = "a" * 64
@@ -22,11 +22,10 @@ LOG = "".join(f"line {i}\n" for i in range(100))
 
 @pytest.fixture(autouse=True)
 def no_cluster(monkeypatch, tmp_path):
-    """A user without a token, and an environment that names no cluster and is put back."""
-    for name in ("RAY_API_SERVER_ADDRESS", "RAY_ADDRESS", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
+    """An environment that names no cluster, and no token but that of this process; it is put back."""
+    for name in ("RAY_API_SERVER_ADDRESS", "RAY_ADDRESS", "RAY_AUTH_TOKEN_PATH"):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
-    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("HOME", str(tmp_path))
 
 
@@ -116,8 +115,7 @@ def test_the_given_address_goes_before_the_environment(monkeypatch):
         ({}, False),
     ],
 )
-def test_a_token_travels_where_there_is_one(environment, travels, monkeypatch):
-    monkeypatch.delenv("RAY_AUTH_MODE")
+def test_a_token_travels_where_there_is_one(environment, travels):
     seen = []
 
     async def answer(request: web.Request) -> web.Response:
@@ -126,7 +124,7 @@ def test_a_token_travels_where_there_is_one(environment, travels, monkeypatch):
 
     with serving(web.get("/api/version", answer)) as address:
         command = [sys.executable, "-m", "deploy", "submit", "--address", address, "train"]
-        done = subprocess.run(command, cwd=ROOT, env={**os.environ, **environment}, timeout=120, check=False)
+        done = subprocess.run(command, cwd=ROOT, env={**clean_environment(), **environment}, timeout=120, check=False)
     assert done.returncode == 2, "there are no jobs here"
     assert set(seen) == {f"Bearer {TOKEN}" if travels else None}
 
