@@ -10,6 +10,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+GREEDY = -1
+"""In the place of an action: the policy's own."""
+
 
 class Exploration(NamedTuple):
     """Settings of epsilon-greedy exploration (see RunConfig for their meaning)."""
@@ -34,7 +37,16 @@ def epsilon(exploration: Exploration, env_steps: int, worker_id: int, workers: i
     return exploration.start + done * (exploration.end - exploration.start)
 
 
-def explore(greedy: NDArray[np.int64], rate: float, num_actions: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Replaces each of `greedy` `[batch]` by a uniform action with probability `rate`."""
-    random = rng.integers(num_actions, size=len(greedy))
-    return np.where(rng.random(len(greedy)) < rate, random, greedy)
+def draw_detours(shape: tuple[int, ...], rate: float, num_actions: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """What epsilon-greedy does of its own accord, for many steps at once.
+
+    Returns:
+      A uniform action with probability `rate`, else GREEDY; of `shape`.
+    """
+    random = rng.integers(num_actions, size=shape)
+    return np.where(rng.random(shape) < rate, random, GREEDY)
+
+
+def explore(greedy: NDArray[np.int64], detours: NDArray[np.int64]) -> NDArray[np.int64]:
+    """`greedy` `[batch]`, with the actions of `detours` `[batch]` in the place of some."""
+    return np.where(detours == GREEDY, greedy, detours)

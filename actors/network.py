@@ -13,6 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from sim_core.jit import kernel
+
 
 class WeightsSnapshot(NamedTuple):
     """A published policy: weights and biases of each layer of a plain network in turn, float32.
@@ -120,6 +122,8 @@ def load_snapshot(network: QNetwork, weights: WeightsSnapshot) -> None:
 class Policy:
     """Action values in numpy from published weights.
 
+    Hidden layers lie in memory that is kept between calls: to ask for it anew costs as much as what is written to it.
+
     Args:
       weights: the snapshot to act with.
     """
@@ -127,19 +131,38 @@ class Policy:
     def __init__(self, weights: WeightsSnapshot) -> None:
         self.weights = weights
         arrays = weights.arrays
-        self._layers = [(matrix.T, bias) for matrix, bias in zip(arrays[::2], arrays[1::2], strict=True)]
+        self._layers = [(matrix.T.copy(), bias) for matrix, bias in zip(arrays[::2], arrays[1::2], strict=True)]
+        self._seen = np.empty((0, 0), np.float32)
+        self._hidden: list[NDArray[np.float32]] = []
 
     def values(self, observation: NDArray[np.generic]) -> NDArray[np.float32]:
         """Action values `[batch, actions]` of observations `[batch, *shape]`."""
-        x = observation.reshape(len(observation), -1).astype(np.float32)
-        for matrix, bias in self._layers[:-1]:
-            x = x @ matrix
-            x += bias
-            np.maximum(x, 0, out=x)
+        count = len(observation)
+        if len(self._seen) != count:
+            self._seen = np.empty((count, len(self._layers[0][0])), np.float32)
+            self._hidden = [np.empty((count, len(bias)), np.float32) for _, bias in self._layers[:-1]]
+        x = self._seen
+        x[...] = observation.reshape(count, -1)
+        for (matrix, bias), out in zip(self._layers, self._hidden, strict=False):
+            np.dot(x, matrix, out=out)
+            _shift_and_rectify(out, bias)
+            x = out
         matrix, bias = self._layers[-1]
-        return np.asarray(x @ matrix + bias, np.float32)
+        values: NDArray[np.float32] = np.dot(x, matrix)
+        values += bias
+        return values
 
     def greedy(self, observation: NDArray[np.generic]) -> NDArray[np.int64]:
         """Best actions `[batch]`; the lowest index among equals."""
         best: NDArray[np.int64] = np.argmax(self.values(observation), axis=1)
         return best
+
+
+@kernel
+def _shift_and_rectify(x: NDArray[np.float32], bias: NDArray[np.float32]) -> None:
+    """max(x + bias, 0) in place, in one pass where numpy takes two; NaN stays NaN."""
+    zero = np.float32(0)
+    for row in range(x.shape[0]):
+        for column in range(x.shape[1]):
+            value = x[row, column] + bias[column]
+            x[row, column] = zero if value <= zero else value

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.exploration import explore
+from actors.exploration import draw_detours, explore
 from actors.network import Policy, WeightsSnapshot
 from actors.nstep import NStepAssembler, Steps, empty_steps
 from actors.transitions import (
@@ -79,8 +79,10 @@ class RolloutWorker:
         """
         if self._policy is None:
             raise RuntimeError("a rollout worker needs weights before it collects")
-        steps = empty_steps(self._settings.steps_per_block, self._settings.num_envs, self._dtype)
-        ended = [self._step(self._policy, rate, steps, i) for i in range(self._settings.steps_per_block)]
+        count = self._settings.steps_per_block
+        steps = empty_steps(count, self._settings.num_envs, self._dtype)
+        detours = draw_detours((count, self._settings.num_envs), rate, self._num_actions, self._rng)
+        ended = [self._step(self._policy, detours[i], steps, i) for i in range(count)]
         rows = self._nstep.push(steps)
         self._made += len(rows)
         weights = self._policy.weights
@@ -92,15 +94,15 @@ class RolloutWorker:
             policy_version=weights.version,
             policy_time_s=weights.time_s,
             epsilon=rate,
-            env_steps=self._settings.steps_per_block * self._settings.num_envs,
+            env_steps=count * self._settings.num_envs,
             made=self._made,
         )
         self._sequence += 1
         return TransitionBlock(header, rows, join_stats([stats for stats in ended if stats]))
 
-    def _step(self, policy: Policy, rate: float, steps: Steps, i: int) -> EpisodeStats | None:
+    def _step(self, policy: Policy, detours: NDArray[np.int64], steps: Steps, i: int) -> EpisodeStats | None:
         """One step of every environment, written as step i of `steps`; the episodes that it ended, if any."""
-        action = explore(policy.greedy(self._observation), rate, self._num_actions, self._rng)
+        action = explore(policy.greedy(self._observation), detours)
         observation, reward, terminated, truncated, infos = self._env.step(action)
         done = terminated | truncated
         steps.observation[i], steps.action[i], steps.reward[i] = self._observation, action, reward

@@ -92,5 +92,6 @@ def final_observations(observation: NDArray[Any], done: NDArray[np.bool_], infos
     if not done.any():
         return observation
     reached = observation.copy()
-    reached[done] = np.stack(list(infos["final_obs"][done]))
+    final = infos["final_obs"][done]
+    reached[done] = final if final.dtype == observation.dtype else np.stack(list(final))  # Gymnasium's are objects
     return reached

@@ -49,6 +49,23 @@ def test_relu_stands_between_layers_and_not_after_the_last():
     np.testing.assert_array_equal(policy.values(np.array([[3.0, -4.0]])), [[-4.0, -1.0]])
 
 
+def test_values_stay_what_they_were_when_the_policy_acts_again():
+    policy = Policy(snapshot(make_network(4, (6, 5), 3), 0, 0.0))
+    first = policy.values(observations((4,), np.float32, seed=1))
+    kept = first.copy()
+    for batch in (7, 2, 7):
+        policy.values(observations((4,), np.float32, seed=2, batch=batch))
+    np.testing.assert_array_equal(first, kept)
+
+
+def test_a_network_that_has_come_to_nan_says_so():
+    nan = np.full((2, 1), np.nan, np.float32)
+    zero = np.zeros(2, np.float32)
+    assert np.isnan(
+        Policy(WeightsSnapshot(0, 0.0, (nan, zero, np.eye(2, dtype=np.float32), zero))).values(np.ones((1, 1)))
+    ).all()
+
+
 def test_ties_go_to_the_lowest_index():
     zeros = (np.zeros((3, 2), np.float32), np.zeros(3, np.float32))
     output = (np.zeros((4, 3), np.float32), np.array([1, 2, 2, 0], np.float32))
