@@ -1,4 +1,4 @@
-"""`shoal chaos`: trains while a seeded schedule kills and freezes processes, fills disks and delays messages."""
+"""`shoal chaos`: trains while a seeded schedule kills, freezes and delays processes and fills disks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rich.table import Table
 
 from deploy.chaos_checks import complaints, success
 from deploy.chaos_config import CONFIG, NAME, write_config
-from deploy.chaos_processes import Driver, TrackingServer, fill_disk, network_delay
+from deploy.chaos_processes import Driver, TrackingServer, fill_disk
 from deploy.folders import make_folder
 from deploy.options import Chaos
 from learner.checkpoint import finished_names
@@ -82,7 +82,7 @@ class _ChaosRun:
         self._rng = random.Random(command.seed)
         self.folder = RunFolder(command.out / NAME)
         self.server = TrackingServer(command.out)
-        self.driver = Driver(command.out / "driver.log", network_delay(command.network_delay_ms))
+        self.driver = Driver(command.out / "driver.log")
         self.injected: list[Injected] = []
         self.outages: list[Injected] = []
         self._server_back_s = 0.0

@@ -94,12 +94,10 @@ class Driver:
 
     Args:
       log: the file.
-      environment: variables that it starts with beside ours.
     """
 
-    def __init__(self, log: Path, environment: dict[str, str]) -> None:
+    def __init__(self, log: Path) -> None:
         self._log = log
-        self._environment = os.environ | environment
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self, *arguments: str) -> None:
@@ -109,7 +107,6 @@ class Driver:
                 [sys.executable, "-m", "deploy", *arguments],
                 stdout=log,
                 stderr=log,
-                env=self._environment,
                 start_new_session=True,
             )
 
@@ -151,11 +148,6 @@ class Driver:
     def tail(self, lines: int) -> str:
         """The end of its output."""
         return "\n".join(self._log.read_text(errors="replace").splitlines()[-lines:])
-
-
-def network_delay(delay_ms: float) -> dict[str, str]:
-    """What makes every message of Ray's late by 0 to `delay_ms`, each by another time; nothing for 0."""
-    return {"RAY_testing_asio_delay_us": f"*=0:{round(1000 * delay_ms)}"} if delay_ms else {}
 
 
 def fill_disk(process: psutil.Process) -> Callable[[], None]:

@@ -142,8 +142,6 @@ class Chaos:
     """Mean time between two faults."""
     deadline_s: float = 10.0
     """Seconds of silence after which a part is replaced."""
-    network_delay_ms: float = 0.0
-    """Every message of Ray's comes late by 0 to so many milliseconds; Ray 2.60's own raylet may not survive 2."""
     limit_s: float = 3_600.0
     """The run counts as hanging after so many seconds."""
 
@@ -152,7 +150,6 @@ class Chaos:
         require(self.faults >= 0, f"--faults must not be negative, not {self.faults}")
         require(self.every_s > 0, f"--every-s must be greater than 0, not {self.every_s}")
         require(self.deadline_s > 4, f"--deadline-s must be above 4, twice the longest delay, not {self.deadline_s}")
-        require(self.network_delay_ms >= 0, f"--network-delay-ms must not be negative, not {self.network_delay_ms}")
         require(self.limit_s > 0, f"--limit-s must be greater than 0, not {self.limit_s}")
 
 

@@ -142,8 +142,9 @@ def row(kind: str, series: list[Usage], quarter_s: float) -> tuple[list[str], bo
     return [*words, "yes" if flat else "NO"], flat
 
 
-def report(samples: list[Usage], seconds: float, console: Console) -> bool:
+def report(samples: list[Usage], console: Console) -> bool:
     """Prints the table; returns whether all is flat."""
+    seconds = max(sample.time_s for sample in samples)
     table = Table(title=f"{seconds / 3600:.2f} h of training: medians of the second → the last quarter")
     for column in ("kind", "number", "handles", "threads", "own memory, MB", "growth, MB/h", "flat"):
         table.add_column(column, justify="left" if column == "kind" else "right")
@@ -171,13 +172,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/soak"), help="a new folder for the run and soak.csv")
     options, flags = parser.parse_known_args(arguments)
     options.out.mkdir(parents=True)
-    seconds = 3600 * options.hours
-    sampler = Sampler(seconds, options.every_s, options.out / "soak.csv")
+    sampler = Sampler(3600 * options.hours, options.every_s, options.out / "soak.csv")
     sampler.start()
     place = ["--name", "soak", "--runs-dir", str(options.out), "--total-env-steps", str(FOREVER)]
     code = shoal(["train", *place, *flags])
     console = Console(width=140)
-    flat = report(sampler.samples, seconds, console)
+    flat = report(sampler.samples, console)
     left = left_over()
     console.print(f"`shoal train` ended with exit code {code}; {len(left)} processes left over", highlight=False)
     return 0 if flat and not left else 1

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from deploy.chaos import FULL, KINDS, MLFLOW, Injected, Kind, table, with_recovery
 from deploy.chaos_config import write_config
-from deploy.chaos_processes import fill_disk, network_delay
+from deploy.chaos_processes import fill_disk
 from deploy.cli import main, read_config_file
 from learner.fault_log import DRIVER, FaultEntry
 
@@ -102,10 +102,6 @@ def test_a_process_whose_disk_is_full_gets_errors_until_it_is_not(tmp_path):
         assert write("c") == "written"
 
 
-def test_ray_is_told_of_the_networks_delay():
-    assert network_delay(2.5) == {"RAY_testing_asio_delay_us": "*=0:2500"} and network_delay(0) == {}
-
-
 def test_the_run_under_attack_has_two_of_everything_that_can_be_lost(tmp_path):
     write_config(tmp_path / "chaos.toml", 5_000)
     config = read_config_file(tmp_path / "chaos.toml")
@@ -119,7 +115,6 @@ def test_the_run_under_attack_has_two_of_everything_that_can_be_lost(tmp_path):
         ("--env-steps", "10"),
         ("--every-s", "0"),
         ("--deadline-s", "3"),
-        ("--network-delay-ms", "-1"),
         ("--limit-s", "-1"),
     ],
 )

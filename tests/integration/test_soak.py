@@ -18,7 +18,7 @@ def series(kind="learner", processes=lambda i: 1, megabytes=lambda i: 300.0, han
 
 
 def is_flat(samples):
-    return report(samples, 7_200.0, Console(quiet=True))
+    return report(samples, Console(quiet=True))
 
 
 def test_noise_and_what_comes_before_the_second_quarter_are_flat():

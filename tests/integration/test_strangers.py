@@ -5,11 +5,9 @@ cluster, one is a stranger's.
 """
 
 import json
-import os
 import re
 import secrets
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -18,13 +16,13 @@ from typing import NamedTuple
 
 import pytest
 
-from tests.integration.conftest import clean_environment
-from tests.integration.ray_head import ROOT, copy_of_the_code, end, ray_start
+from tests.integration.machines import ROOT, at, connect, machines, on, root
+from tests.integration.ray_head import copy_of_the_code, end, ray_start
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(600)]
 
 FIREWALL = ROOT / "deploy" / "firewall.nft"
-HEAD, MEMBER, STRANGER = "10.77.1.1", "10.77.1.2", "10.77.2.2"
+HEAD, MEMBER, GATE, STRANGER = "10.77.1.1", "10.77.1.2", "10.77.2.1", "10.77.2.2"
 METRICS, DASHBOARD = 8080, 8265
 LISTENING = """
 import json, psutil
@@ -44,48 +42,12 @@ print(json.dumps([port for port in map(int, sys.argv[2:]) if is_open(port)]))
 READ = "import sys, urllib.request; print(urllib.request.urlopen(sys.argv[1], timeout=20).read().decode())"
 
 
-def root(*words: str) -> None:
-    subprocess.run(words, check=True, capture_output=True)
-
-
 class Machines(NamedTuple):
-    """Names of the three namespaces."""
+    """Names of the three."""
 
     head: str
     member: str
     stranger: str
-
-    @classmethod
-    def make(cls) -> "Machines":
-        """Makes them: a cable goes from the head to each of the others."""
-        made = cls(*(f"shoal-{os.getpid()}-{name}" for name in cls._fields))
-        for name in made:
-            root("ip", "netns", "add", name)
-            root("ip", "-n", name, "link", "set", "lo", "up")
-        for other, here, there in ((made.member, HEAD, MEMBER), (made.stranger, "10.77.2.1", STRANGER)):
-            ours, theirs = (f"c{secrets.token_hex(5)}" for _ in range(2))
-            root("ip", "link", "add", ours, "netns", made.head, "type", "veth", "peer", "name", theirs, "netns", other)
-            for name, cable, address in ((made.head, ours, here), (other, theirs, there)):
-                root("ip", "-n", name, "addr", "add", f"{address}/24", "dev", cable)
-                root("ip", "-n", name, "link", "set", cable, "up")
-        root("ip", "-n", made.stranger, "route", "add", "10.77.1.0/24", "via", "10.77.2.1")
-        return made
-
-    def unmake(self) -> None:
-        for name in self:
-            root("ip", "netns", "del", name)
-
-
-def on(machine: str, *words: str, auth: dict[str, str] | None = None, cwd: Path = ROOT) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        ["ip", "netns", "exec", machine, *words],
-        env={**clean_environment(), **(auth or {})},
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=200,
-        check=False,
-    )
 
 
 def python(machine: str, program: str, *arguments: object):
@@ -95,24 +57,26 @@ def python(machine: str, program: str, *arguments: object):
 
 
 @pytest.fixture(scope="module")
-def machines() -> Iterator[Machines]:
-    if os.geteuid() != 0 or not shutil.which("ip") or not shutil.which("nft"):
-        pytest.skip("needs root, iproute2 and nftables, to make networks of machines")
-    made = Machines.make()
-    yield made
-    made.unmake()
+def trio() -> Iterator[Machines]:
+    if not shutil.which("nft"):
+        pytest.skip("needs nftables")
+    with machines("head", "member", "stranger") as names:
+        made = Machines(*names)
+        connect(made.head, HEAD, made.member, MEMBER)
+        connect(made.head, GATE, made.stranger, STRANGER)
+        root("ip", "-n", made.stranger, "route", "add", "10.77.1.0/24", "via", GATE)
+        yield made
 
 
 @pytest.fixture(scope="module")
-def token(machines) -> Iterator[str]:
+def token(trio) -> Iterator[str]:
     """The token of a head that listens on all interfaces, before its firewall stands."""
     folder = Path(tempfile.mkdtemp(prefix="sh", dir="/tmp"))  # short: Ray's sockets lie in it
     secret = secrets.token_hex(32)
     auth = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secret}
     words = ["--head", f"--node-ip-address={HEAD}", "--dashboard-host=0.0.0.0", f"--temp-dir={folder}", "--num-cpus=1"]
     words += [f"--metrics-export-port={METRICS}", f"--dashboard-port={DASHBOARD}"]
-    before = ("ip", "netns", "exec", machines.head)
-    process = ray_start(folder / "log", *words, auth=auth, before=before)
+    process = ray_start(folder / "log", *words, auth=auth, before=at(trio.head))
     assert process.poll() is None, (folder / "log").read_text()
     yield secret
     end(process)
@@ -120,34 +84,34 @@ def token(machines) -> Iterator[str]:
 
 
 @pytest.fixture
-def firewall(machines, tmp_path) -> Iterator[None]:
+def firewall(trio, tmp_path) -> Iterator[None]:
     """What we give, with the addresses of these machines in it."""
     text, count = re.subn(r"(define machines = ){.*}", rf"\1{{ {HEAD}, {MEMBER} }}", FIREWALL.read_text())
     assert count == 1
     (tmp_path / "firewall.nft").write_text(text)
     for _ in range(2):  # once more over itself, as an operator does
-        done = on(machines.head, "nft", "-f", str(tmp_path / "firewall.nft"))
+        done = on(trio.head, "nft", "-f", str(tmp_path / "firewall.nft"))
         assert done.returncode == 0, done.stderr
     yield
-    on(machines.head, "nft", "delete", "table", "inet", "shoal")
+    on(trio.head, "nft", "delete", "table", "inet", "shoal")
 
 
-def test_a_stranger_finds_no_open_port_behind_the_firewall(machines, token, firewall):
-    ports = json.loads(python(machines.head, LISTENING))
+def test_a_stranger_finds_no_open_port_behind_the_firewall(trio, token, firewall):
+    ports = json.loads(python(trio.head, LISTENING))
     assert {METRICS, DASHBOARD, 6379} <= set(ports)
-    assert json.loads(python(machines.member, OPEN, HEAD, *ports)) == ports
-    assert json.loads(python(machines.stranger, OPEN, HEAD, *ports)) == []
-    assert "ray_node_cpu_count" in python(machines.member, READ, f"http://{HEAD}:{METRICS}/metrics")
+    assert json.loads(python(trio.member, OPEN, HEAD, *ports)) == ports
+    assert json.loads(python(trio.stranger, OPEN, HEAD, *ports)) == []
+    assert "ray_node_cpu_count" in python(trio.member, READ, f"http://{HEAD}:{METRICS}/metrics")
 
 
-def test_without_the_firewall_anybody_reads_the_metrics(machines, token):
+def test_without_the_firewall_anybody_reads_the_metrics(trio, token):
     """Why there is one: a Ray that asks for a token gives its metrics without."""
-    assert "ray_node_cpu_count" in python(machines.stranger, READ, f"http://{HEAD}:{METRICS}/metrics")
+    assert "ray_node_cpu_count" in python(trio.stranger, READ, f"http://{HEAD}:{METRICS}/metrics")
 
 
 @pytest.mark.parametrize("shown", ["none", "another"])
 @pytest.mark.parametrize("words", ["shoal submit", "ray job submit"])
-def test_a_job_without_the_token_is_refused(words, shown, machines, token, tmp_path):
+def test_a_job_without_the_token_is_refused(words, shown, trio, token, tmp_path):
     """By the token alone, with no firewall in between."""
     checkout = copy_of_the_code(tmp_path / "checkout")
     auth = {"HOME": str(tmp_path), "PYTHONPATH": str(checkout), "RAY_AUTH_MODE": "disabled"}
@@ -166,13 +130,13 @@ def test_a_job_without_the_token_is_refused(words, shown, machines, token, tmp_p
             "touch",
             str(tmp_path / "t"),
         ]
-    done = on(machines.member, *command, auth=auth, cwd=checkout)
+    done = on(trio.member, *command, auth=auth, cwd=checkout)
     assert done.returncode != 0
     if words == "shoal submit":
         assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
         assert "RAY_AUTH_TOKEN" in done.stderr.splitlines()[-1]
     asked = [str(Path(sys.executable).parent / "ray"), "job", "list", *place]
-    listed = on(machines.member, *asked, auth={"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": token})
+    listed = on(trio.member, *asked, auth={"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": token})
     assert listed.returncode == 0, listed.stderr
     assert "submission_id" not in listed.stdout, listed.stdout
     assert not (tmp_path / "t").exists() and not (tmp_path / "runs").exists()
