@@ -55,9 +55,10 @@ FAULTS: tuple[tuple[tuple[type[Exception], ...], Fault], ...] = (
     ((GetTimeoutError,), Fault.LATE),
 )
 """What errors of Ray mean; the first match counts."""
-KEEP_IDLE_MS = 24 * 3_600_000
-"""How long a Ray of our own keeps a process that waits for tasks: evaluations are tasks beside actors that take all CPU
-slots, and Ray would end their process after a second and start the next one from nothing."""
+OWN_RAY = {"idle_worker_killing_time_threshold_ms": 24 * 3_600_000, "task_events_report_interval_ms": 0}
+"""Settings of a Ray of our own. It keeps processes that wait for tasks: evaluations are tasks beside actors that take
+all CPU slots, and Ray would end their process after a second and start the next one from nothing. And it keeps no list
+of the last 100,000 calls, 300 MB that only its dashboard would show, and there is none."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
@@ -179,7 +180,7 @@ def connect(cpus: int, address: str | None) -> None:
     options: dict[str, Any] = {"address": address}
     if address is None:
         options = {"address": "local", "include_dashboard": False, "num_cpus": max(cpus, os.cpu_count() or 1)}
-        options["_system_config"] = {"idle_worker_killing_time_threshold_ms": KEEP_IDLE_MS}
+        options["_system_config"] = OWN_RAY
     try:
         ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
     except (ConnectionError, AuthenticationError) as error:
