@@ -72,7 +72,7 @@ class PartWriter:
             self._written = Written(files, None)
         except Exception as error:  # whatever a disk, a storage's client or a format raises: the run goes on
             self._written = Written({}, f"{type(error).__name__}: {error}")
-        give_back()  # now and then, and not while anybody waits
+        threading.Thread(target=give_back, name="shoal-memory", daemon=True).start()  # nobody waits for it
 
     def result(self, timeout_s: float = 0.0) -> Written | None:
         """How the last part ended; None while it is still being written after `timeout_s`."""
