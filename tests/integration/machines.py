@@ -18,8 +18,8 @@ from random import Random
 import pytest
 
 from tests.integration.conftest import clean_environment
+from tests.integration.ray_head import ROOT
 
-ROOT = Path(__file__).parents[2]
 TUN = Path("/dev/net/tun")
 SET_INTERFACE, RAW_IP_PACKETS = 0x400454CA, 0x1001
 LARGEST_PACKET = 60_000

@@ -64,6 +64,11 @@ LOOPBACK = ("--node-ip-address=127.0.0.1",)
 NO_TOKEN = {"RAY_AUTH_MODE": "disabled"}
 
 
+def with_token(token: str) -> dict[str, str]:
+    """The variables of a process that shows a token, or asks for it."""
+    return {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": token}
+
+
 def ray_start(log: Path, *words: str, auth: dict[str, str], before: Sequence[str] = ()) -> subprocess.Popen:
     """`ray start --block`, with the words `before` in front of it, once it has started or ended."""
     binaries = str(Path(sys.executable).parent)
@@ -137,7 +142,7 @@ def joined_node(head: Head, log: Path, *words: str) -> Iterator[subprocess.Popen
 
 
 def kill(node: subprocess.Popen) -> None:
-    """Takes a node away as a power cut does: all of its processes at once."""
+    """Takes a node, or a driver, away as a power cut does: all of its processes at once."""
     for process in [*psutil.Process(node.pid).children(recursive=True), psutil.Process(node.pid)]:
         process.kill()
     node.wait(30)

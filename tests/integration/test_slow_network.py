@@ -7,18 +7,16 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
-import psutil
 import pytest
 
 from deploy.chaos_checks import complaints
 from learner.fault_log import read_faults
 from learner.run_folder import RunFolder
 from tests.integration.conftest import SMALL, clean_environment, flags
-from tests.integration.machines import ROOT, SlowCable, at, machines
-from tests.integration.ray_head import end, ray_start
+from tests.integration.machines import SlowCable, at, machines
+from tests.integration.ray_head import ROOT, end, kill, ray_start, wait_for, with_token
 
 pytestmark = [
     pytest.mark.ray,
@@ -47,7 +45,7 @@ class Cluster:
 
     def __init__(self, head: str, far: str, folder: Path) -> None:
         self._machines, self._folder = (head, far), folder
-        self.auth = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        self.auth = with_token(secrets.token_hex(32))
         self.nodes = [self._start(0, "--head", "--include-dashboard=false", f"--system-config={json.dumps(QUICK)}")]
         self.join()
 
@@ -97,10 +95,7 @@ def wired():
 
 def wait_for_steps(folder: RunFolder, env_steps: int, job: subprocess.Popen, log: Path) -> None:
     """Waits until the run's journal has come so far."""
-    deadline_s = time.monotonic() + 240
-    while not folder.journal.is_file() or steps(folder) < env_steps:
-        assert job.poll() is None and time.monotonic() < deadline_s, log.read_text()
-        time.sleep(0.2)
+    wait_for(lambda: folder.journal.is_file() and steps(folder) >= env_steps, log.read_text, job)
 
 
 def steps(folder: RunFolder) -> int:
@@ -124,9 +119,7 @@ def test_a_run_outlives_a_slow_and_a_cut_cable(wired, tmp_path):
         assert job.wait(400) == 0, log.read_text()
     finally:
         if job.poll() is None:
-            for process in [*psutil.Process(job.pid).children(recursive=True), psutil.Process(job.pid)]:
-                process.kill()
-            job.wait(30)
+            kill(job)
     assert steps(folder) >= CONFIG.total_env_steps
     assert {entry.event for entry in read_faults(folder.faults)} >= {"failed", "mended"}, log.read_text()
     assert complaints(folder) == []

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import pytest
 
-from tests.integration.machines import ROOT, at, connect, machines, on, root
-from tests.integration.ray_head import copy_of_the_code, end, ray_start
+from tests.integration.machines import at, connect, machines, on, root
+from tests.integration.ray_head import ROOT, copy_of_the_code, end, ray_start, with_token
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(600)]
 
@@ -73,10 +73,9 @@ def token(trio) -> Iterator[str]:
     """The token of a head that listens on all interfaces, before its firewall stands."""
     folder = Path(tempfile.mkdtemp(prefix="sh", dir="/tmp"))  # short: Ray's sockets lie in it
     secret = secrets.token_hex(32)
-    auth = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secret}
     words = ["--head", f"--node-ip-address={HEAD}", "--dashboard-host=0.0.0.0", f"--temp-dir={folder}", "--num-cpus=1"]
     words += [f"--metrics-export-port={METRICS}", f"--dashboard-port={DASHBOARD}"]
-    process = ray_start(folder / "log", *words, auth=auth, before=at(trio.head))
+    process = ray_start(folder / "log", *words, auth=with_token(secret), before=at(trio.head))
     assert process.poll() is None, (folder / "log").read_text()
     yield secret
     end(process)
@@ -116,7 +115,7 @@ def test_a_job_without_the_token_is_refused(words, shown, trio, token, tmp_path)
     checkout = copy_of_the_code(tmp_path / "checkout")
     auth = {"HOME": str(tmp_path), "PYTHONPATH": str(checkout), "RAY_AUTH_MODE": "disabled"}
     if shown == "another":
-        auth |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        auth |= with_token(secrets.token_hex(32))
     place = ["--address", f"http://{HEAD}:{DASHBOARD}"]
     if words == "shoal submit":
         command = [sys.executable, "-m", "deploy", "submit", *place, "train", "--runs-dir", str(tmp_path / "runs")]
@@ -136,7 +135,7 @@ def test_a_job_without_the_token_is_refused(words, shown, trio, token, tmp_path)
         assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
         assert "RAY_AUTH_TOKEN" in done.stderr.splitlines()[-1]
     asked = [str(Path(sys.executable).parent / "ray"), "job", "list", *place]
-    listed = on(trio.member, *asked, auth={"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": token})
+    listed = on(trio.member, *asked, auth=with_token(token))
     assert listed.returncode == 0, listed.stderr
     assert "submission_id" not in listed.stdout, listed.stdout
     assert not (tmp_path / "t").exists() and not (tmp_path / "runs").exists()
