@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+RLLIB := $(VENV)/rllib
 
-.PHONY: train test bench bench-exactness fuzz soak lint setup clean
+.PHONY: train test bench bench-peers bench-exactness fuzz soak lint setup clean
 
 setup: $(READY)
 
@@ -31,6 +32,17 @@ test: lint
 
 bench: $(READY)
 	$(BIN)/python -m tests.benchmarks $(ARGS)
+
+# The same trainings by Stable-Baselines3, TorchRL and RLlib, which pins another Gymnasium and so lives in a folder of its
+# own. ARGS="cartpole --rounds 1" for a short one.
+bench-peers: $(READY) $(RLLIB)/.ready
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,peers]'
+	$(BIN)/python -m tests.benchmarks.peers --rllib $(RLLIB)/bin/python $(ARGS)
+
+$(RLLIB)/.ready: pyproject.toml
+	$(PYTHON) -m venv $(RLLIB)
+	$(RLLIB)/bin/python -m pip install --quiet --disable-pip-version-check --editable . 'ray[rllib]'
+	touch $@
 
 # How exact the simulator is: RVO2, float64, FL-ORCA's episodes. ARGS="--episodes 20 --scenes 800" for a short one.
 bench-exactness: $(READY)

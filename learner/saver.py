@@ -13,7 +13,7 @@ from learner.config import RunConfig, to_dict
 from learner.journal import Journal
 from learner.mending import Mender
 from learner.progress import Progress
-from learner.retention import scores_of
+from learner.retention import Scored, scores_of
 
 LEARNER = Part(PartKind.LEARNER)
 
@@ -60,6 +60,9 @@ class Saver:
         self._progress = progress
         self._journal = journal
         self._observer = observer
+        self._scores: list[Scored] = []
+        self._scored_to = 0
+        """Rows before this byte of the journal have been looked through for scores: hours of them are long."""
         self._saved: Location | None = None
         self._saved_at: tuple[int, int] | None = None
         self.is_wanted = False
@@ -111,8 +114,9 @@ class Saver:
     def _seal(self, moment: Moment) -> Keep:
         """Makes the journal durable before a checkpoint counts on it; tells which checkpoints stay."""
         self._journal.sync()
-        scores = scores_of(self._journal.rows(0, moment.journal_offset))
-        return Keep(self._config.keep_checkpoints, self._keep_best, scores)
+        self._scores += scores_of(self._journal.rows(self._scored_to, moment.journal_offset))
+        self._scored_to = moment.journal_offset
+        return Keep(self._config.keep_checkpoints, self._keep_best, list(self._scores))
 
     def poll(self) -> PartFailed | None:
         """Tells of a checkpoint that has ended; a part that failed meanwhile is the caller's to mend."""

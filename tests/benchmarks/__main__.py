@@ -9,6 +9,7 @@ from pathlib import Path
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+from learner.ray_auth import guard_ray  # noqa: E402
 from tests.benchmarks import simulator  # noqa: E402
 
 BENCHMARKS = ("simulator", "replay", "learner", "service", "export", "checkpoints")
@@ -33,6 +34,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 def main() -> int:
     options = parse()
+    guard_ray(joins=False)  # before a benchmark imports Ray
     for name in options.names or BENCHMARKS:
         if name == "simulator":
             simulator.main(options.sections, [path.resolve() for path in options.rvo2])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import time
 
 import mlflow
 import numpy as np
@@ -210,13 +211,21 @@ def test_a_cell_of_which_every_checkpoint_is_damaged_begins_anew_and_logs_nothin
 def test_a_checkpoint_of_another_config_is_no_reason_to_begin_anew(store, cell, tmp_path):
     cell = cell._replace(key=f"{cell.key}-other")
     place = SweepPlace(tmp_path, store, "cells")
+    checkpoints = tmp_path / cell.key / "checkpoints"
+
+    def crash_after_a_checkpoint(row):
+        if row.env_steps >= 2_600:
+            while not any(checkpoints.glob("step-*")):  # pytest's limit ends a wait in vain
+                time.sleep(0.01)
+            raise Crash
+
     with pytest.raises(Crash):
-        run_cell(SWEEP, cell, place, crashing_at(2_600))
-    kept = sorted((tmp_path / cell.key / "checkpoints").iterdir())
+        run_cell(SWEEP, cell, place, crash_after_a_checkpoint)
+    kept = sorted(checkpoints.iterdir())
     other = cell._replace(config=dataclasses.replace(cell.config, learning_rate=0.5))
     with pytest.raises(CheckpointError, match="learning_rate is 0.5 instead of 0.001"):
         run_cell(SWEEP, other._replace(key=cell.key), place, id)
-    assert sorted((tmp_path / cell.key / "checkpoints").iterdir()) == kept
+    assert sorted(checkpoints.iterdir()) == kept
 
 
 def test_a_cell_whose_folder_is_gone_keeps_its_mlflow_run(store, cell, tmp_path):

@@ -1,0 +1,135 @@
+"""The benchmark against peers: its watch, and that contenders do the work that is set."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.env_util import make_vec_env
+
+from actors.network import Policy, QNetwork, WeightsSnapshot
+from actors.vector_env import make_vector_env
+from learner.config import RunConfig
+from tests.benchmarks import contest, peers
+from tests.benchmarks.contenders.sb3 import Vectorised
+from tests.benchmarks.contest import Heat, Lap, heat_of, layers_of, rhythm, target_every_env_steps
+
+CARTPOLE = peers.contests()["cartpole"].config
+
+
+class Clock:
+    def __init__(self):
+        self.now_s = 100.0
+
+    def __call__(self):
+        return self.now_s
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(contest.time, "perf_counter", clock)
+    return clock
+
+
+def heat(threshold=None, **changes):
+    config = dataclasses.replace(RunConfig(), eval_every_env_steps=1000, eval_episodes=4, **changes)
+    return Heat(config, 8, 1, 10.0, threshold)
+
+
+def test_rates_are_counted_from_after_the_warm_up_and_for_the_time_asked(clock):
+    lap = Lap(heat())
+    env_steps = updates = 0
+    for second in range(100):
+        clock.now_s += 1
+        env_steps += 1000 if second < 20 else 50
+        updates += 0 if second < 5 else 10
+        if lap.over(env_steps, updates):
+            break
+    assert second == 5 + contest.WARM_S + 10  # the first update, then the warm-up
+    found = lap.finding()
+    assert (found.env_steps_per_s, found.updates_per_s, found.to_threshold_s) == (1000, 10, None)
+
+
+def test_the_watch_stands_still_while_the_judge_plays(clock, monkeypatch):
+    scores = iter([0.2, 0.9])
+
+    def judge(self, weights):
+        clock.now_s += 50
+        self._judged_s += 50
+        self.judged(next(scores))
+
+    monkeypatch.setattr(Lap, "_judge", judge)
+    lap = Lap(heat(threshold=0.85))
+    for step in range(1, 5):
+        clock.now_s += 1
+        assert lap.over(step * 500, step, list) == (step == 4)  # judged at 1,000 and 2,000 env steps
+    found = lap.finding()
+    assert found.to_threshold_s == 4.0 and found.score == 0.9
+
+
+def test_the_judge_scores_the_network_that_it_is_given():
+    torch.manual_seed(0)
+    network = QNetwork(16, (32, 32), 8)
+    layers = layers_of(network)
+    observation = np.random.default_rng(0).normal(size=(5, 16)).astype(np.float32)
+    expected = network(torch.from_numpy(observation)).detach().numpy()
+    found = Policy(WeightsSnapshot(0, 0.0, tuple(layers))).values(observation)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    lap = Lap(heat(threshold=2.0))
+    assert not lap.over(1000, 1, lambda: layers)
+    assert 0.0 <= lap.finding().score <= 1.0
+
+
+@pytest.mark.parametrize("envs", [8, 16, 64, 256])
+@pytest.mark.parametrize(("batch", "samples"), [(64, 8.0), (256, 2.0), (512, 8.0)])
+def test_the_rhythm_keeps_the_samples_per_insert(envs, batch, samples):
+    config = dataclasses.replace(RunConfig(), batch_size=batch, samples_per_insert=samples)
+    beat = rhythm(config, envs)
+    assert beat.updates * batch / (beat.vector_steps * envs) == samples
+
+
+def test_the_target_period_in_env_steps_is_that_in_updates():
+    config = dataclasses.replace(RunConfig(), batch_size=256, samples_per_insert=2.0, target_update_interval=500)
+    assert target_every_env_steps(config) == 64_000
+
+
+def test_a_heat_travels_as_json():
+    sent = heat(threshold=0.5, hidden_sizes=(8, 8))
+    assert heat_of(sent.to_json()) == sent
+
+
+def test_the_vectorised_environment_does_as_stable_baselines3s_own():
+    ours, theirs = Vectorised(make_vector_env(CARTPOLE.env, 3)), make_vec_env("CartPole-v1", 3, seed=5)
+    start = ours.env.reset(seed=[5, 6, 7])[0]
+    np.testing.assert_array_equal(start, theirs.reset())
+    actions, ended = np.random.default_rng(0).integers(2, size=(120, 3)), 0
+    for action in actions:
+        found, expected = ours.step(action), theirs.step(action)
+        for mine, other in zip(found[:3], expected[:3], strict=True):
+            np.testing.assert_array_equal(mine, other)
+        for mine, other in zip(found[3], expected[3], strict=True):
+            assert ("terminal_observation" in mine) == ("terminal_observation" in other)
+            if "terminal_observation" in mine:
+                ended += 1
+                np.testing.assert_array_equal(mine["terminal_observation"], other["terminal_observation"])
+    assert ended >= 5
+    ours.close()
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+@pytest.mark.parametrize("module", ["shoal", "sb3"])
+def test_contenders_draw_as_many_samples_per_insert_as_they_are_told(module):
+    contender = peers.Contender(module, "")
+    found = peers.run_heat(contender, Heat(CARTPOLE, 16, 1, 2.0, None))
+    drawn = found.updates_per_s * CARTPOLE.batch_size / found.env_steps_per_s
+    assert drawn == pytest.approx(CARTPOLE.samples_per_insert, rel=0.25)
+    assert found.start_up_s > 0
+
+
+def test_a_contender_that_fails_says_why():
+    with pytest.raises(RuntimeError, match=r"(?s)sb3 failed: .*Environment `nothing` doesn't exist"):
+        peers.run_heat(
+            peers.Contender("sb3", ""), Heat(dataclasses.replace(CARTPOLE, env_id="nothing-v0"), 1, 1, 1.0, None)
+        )
