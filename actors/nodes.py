@@ -18,6 +18,7 @@ from safetensors.numpy import load_file, save_file
 from actors.calls import Calls, Node, Ref
 from actors.faults import Action, CallFailed, Fault, PartKind, decide
 from actors.locations import Location, fetched
+from actors.memory import keep_large_apart
 from actors.network import WeightsSnapshot
 from actors.parts import PartWriter, Written
 from actors.prioritised import PrioritisedShard, PrioritySettings
@@ -50,6 +51,7 @@ class ShardNode:
     """A replay shard that tells every worker of newer weights."""
 
     def __init__(self, settings: ShardSettings) -> None:
+        keep_large_apart()  # blocks come and go here
         self.shard = make_shard(settings)
         self._writer = PartWriter()
         self._version = -1

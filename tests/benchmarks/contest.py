@@ -12,8 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 
+import sim_core  # noqa: F401  registers our environment, in whatever process this is
 from actors.evaluator import evaluate
 from actors.network import WeightsSnapshot
 from learner.config import RunConfig, from_dict, to_dict
@@ -144,6 +146,11 @@ def layers_of(network: Any) -> list[np.ndarray]:
 
     linear = [module for module in network.modules() if isinstance(module, torch.nn.Linear)]
     return [parameter.detach().cpu().numpy().copy() for module in linear for parameter in (module.weight, module.bias)]
+
+
+def float_env(env_id: str) -> gym.Env:
+    """One environment whose observations are float32, for libraries whose networks take nothing else."""
+    return gym.wrappers.DtypeObservation(gym.make(env_id), np.float32)
 
 
 class Rhythm(NamedTuple):

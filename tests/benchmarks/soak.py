@@ -115,10 +115,10 @@ class Sampler(threading.Thread):
                 time.sleep(self._every_s)
 
 
-def growth(series: list[Usage]) -> tuple[float, float, float]:
-    """Megabytes an hour (Theil-Sen's slope) with the 95 % interval."""
+def growth(series: list[Usage], name: str) -> tuple[float, float, float]:
+    """Growth of a column an hour (Theil-Sen's slope) with the 95 % interval."""
     hours = [sample.time_s / 3600 for sample in series]
-    found = stats.theilslopes([sample.megabytes for sample in series], hours, 0.95)
+    found = stats.theilslopes([getattr(sample, name) for sample in series], hours, 0.95)
     return float(found.slope), float(found.low_slope), float(found.high_slope)
 
 
@@ -132,12 +132,12 @@ def row(kind: str, series: list[Usage], quarter_s: float) -> tuple[list[str], bo
     words, flat = [kind], True
     for name in ("processes", "handles", "threads", "megabytes"):
         before, after = (float(np.median([getattr(sample, name) for sample in part])) for part in (early, late))
+        slope, low, high = growth(settled, name)
         if name == "megabytes":
-            slope, low, high = growth(settled)
             flat &= low <= max(FLAT_SHARE_PER_H * before, FLAT_MB_PER_H)
             words += [f"{before:,.1f} → {after:,.1f}", f"{slope:+.2f} ({low:+.2f} … {high:+.2f})"]
         else:
-            flat &= after - before < 1
+            flat &= after - before < 1 or low <= 0  # what is under way at a look goes up and down
             words.append(f"{before:g} → {after:g}")
     return [*words, "yes" if flat else "NO"], flat
 

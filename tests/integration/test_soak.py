@@ -25,6 +25,12 @@ def test_noise_and_what_comes_before_the_second_quarter_are_flat():
     assert is_flat(series(megabytes=lambda i: min(300.0, 3.0 * i), handles=lambda i: 40 + (i % 7 == 0)))
 
 
+def test_a_count_that_goes_up_and_down_is_flat_however_its_quarters_compare():
+    looks = np.random.default_rng(3).integers(4, 24, 4 * QUARTER)
+    looks[QUARTER : 2 * QUARTER : 2], looks[3 * QUARTER :: 2] = 10, 14
+    assert is_flat(series("objects in the store", processes=lambda i: int(looks[i])))
+
+
 @pytest.mark.parametrize(
     "leak",
     [

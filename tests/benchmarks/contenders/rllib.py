@@ -1,23 +1,16 @@
 """RLlib's DQN; it pins another Gymnasium, and so lives in an environment of its own."""
 
-import gymnasium as gym
 import ray
 from ray.rllib.algorithms.dqn import DQNConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.tune import register_env
 
-from tests.benchmarks.contest import Finding, Heat, Lap, compete, layers_of, target_every_env_steps
-
-
-def make_env(settings):
-    import sim_core  # noqa: F401  registers the environment where the runner lives
-
-    return gym.make(settings["env_id"])
+from tests.benchmarks.contest import Finding, Heat, Lap, compete, float_env, layers_of, target_every_env_steps
 
 
 def algorithm(heat: Heat):
     config = heat.config
-    register_env("contest", make_env)
+    register_env("contest", lambda settings: float_env(settings["env_id"]))
     buffer = {"type": "EpisodeReplayBuffer", "capacity": config.replay_capacity}
     return (
         DQNConfig()

@@ -2,14 +2,13 @@
 
 import torch
 from tensordict.nn import TensorDictSequential
-from torchrl.collectors import SyncDataCollector
+from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import GymEnv, SerialEnv
+from torchrl.envs import GymWrapper, SerialEnv
 from torchrl.modules import MLP, EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, HardUpdate
 
-import sim_core  # noqa: F401  registers the environment
-from tests.benchmarks.contest import Finding, Heat, Lap, compete, layers_of, rhythm
+from tests.benchmarks.contest import Finding, Heat, Lap, compete, float_env, layers_of, rhythm
 
 
 def train(heat: Heat) -> Finding:
@@ -18,7 +17,7 @@ def train(heat: Heat) -> Finding:
     torch.manual_seed(config.seed)
 
     def make():
-        return GymEnv(config.env_id, categorical_action_encoding=True)
+        return GymWrapper(float_env(config.env_id), categorical_action_encoding=True)
 
     env = SerialEnv(heat.envs, make)
     env.set_seed(config.seed)
@@ -35,7 +34,7 @@ def train(heat: Heat) -> Finding:
     )
     beat = rhythm(config, heat.envs)
     frames = heat.envs * beat.vector_steps
-    collector = SyncDataCollector(
+    collector = Collector(
         env,
         TensorDictSequential(actor, exploring),
         frames_per_batch=frames,
