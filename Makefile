@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 RLLIB := $(VENV)/rllib
+INSTALL := -m pip install --quiet --disable-pip-version-check --editable
 
 .PHONY: train test bench bench-peers bench-exactness fuzz soak lint setup clean
 
@@ -13,7 +14,7 @@ setup: $(READY)
 $(READY): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "shoal needs Python 3.11 or newer: make PYTHON=python3.11 ...")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(BIN)/python $(INSTALL) '.[dev]'
 	touch $(READY)
 
 # The main job: M_sensor, 10 robots x 2 groups, on a Ray of its own. ARGS adds flags, as in ARGS="--seed 1".
@@ -35,13 +36,16 @@ bench: $(READY)
 
 # The same trainings by Stable-Baselines3, TorchRL and RLlib, which pins another Gymnasium and so lives in a folder of its
 # own. ARGS="cartpole --rounds 1" for a short one.
-bench-peers: $(READY) $(RLLIB)/.ready
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,peers]'
+bench-peers: $(VENV)/.peers $(RLLIB)/.ready
 	$(BIN)/python -m tests.benchmarks.peers --rllib $(RLLIB)/bin/python $(ARGS)
 
-$(RLLIB)/.ready: pyproject.toml
+$(VENV)/.peers: $(READY)
+	$(BIN)/python $(INSTALL) '.[dev,peers]'
+	touch $@
+
+$(RLLIB)/.ready: $(READY)
 	$(PYTHON) -m venv $(RLLIB)
-	$(RLLIB)/bin/python -m pip install --quiet --disable-pip-version-check --editable . 'ray[rllib]'
+	$(RLLIB)/bin/python $(INSTALL) . 'ray[rllib]'
 	touch $@
 
 # How exact the simulator is: RVO2, float64, FL-ORCA's episodes. ARGS="--episodes 20 --scenes 800" for a short one.

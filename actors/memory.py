@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import ctypes
 
-_trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+_libc = ctypes.CDLL(None)
+_trim = getattr(_libc, "malloc_trim", None)
 """glibc's; None with another C library, whose business it is then."""
 _MMAP_THRESHOLD, _ARENA_MAX = -3, -8
 """mallopt's numbers for what is set (malloc.h)."""
@@ -22,9 +23,8 @@ ARENAS = 4
 def keep_large_apart() -> None:
     """Has this process take large pieces of memory from the system one by one; without, glibc soon ceases to."""
     if _trim is not None:
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(_MMAP_THRESHOLD, LARGE_BYTES)
-        mallopt(_ARENA_MAX, ARENAS)
+        _libc.mallopt(_MMAP_THRESHOLD, LARGE_BYTES)
+        _libc.mallopt(_ARENA_MAX, ARENAS)
 
 
 def give_back() -> None:

@@ -26,6 +26,11 @@ class EnvSpec(NamedTuple):
         """Whether this is our own environment."""
         return self.env_id == ENV_ID
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Keyword arguments of Gymnasium's `make` and `make_vec`."""
+        return dataclasses.asdict(self.world) if self.is_swarm else {}
+
 
 def make_vector_env(spec: EnvSpec, num_envs: int) -> gym.vector.VectorEnv[Any, Any, Any]:
     """`num_envs` environments that restart in the same step (`AutoresetMode.SAME_STEP`).
@@ -35,7 +40,7 @@ def make_vector_env(spec: EnvSpec, num_envs: int) -> gym.vector.VectorEnv[Any, A
     """
     try:
         if spec.is_swarm:
-            env = gym.make_vec(ENV_ID, num_envs=num_envs, **dataclasses.asdict(spec.world))
+            env = gym.make_vec(ENV_ID, num_envs=num_envs, **spec.settings)
         else:
             mode = {"autoreset_mode": AutoresetMode.SAME_STEP}
             env = gym.make_vec(spec.env_id, num_envs=num_envs, vectorization_mode="sync", vector_kwargs=mode)

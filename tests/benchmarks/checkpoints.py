@@ -2,7 +2,6 @@
 
 import tempfile
 import time
-from contextlib import closing
 from pathlib import Path
 
 import gymnasium as gym
@@ -14,10 +13,7 @@ from actors.nodes import ShardNode, ShardSettings
 from actors.rollout import join_stats
 from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
 from learner.config import RunConfig
-from learner.journal import Journal
-from learner.loop import TrainingLoop
-from learner.place import Place
-from learner.ray_edge import ray_cluster
+from tests.benchmarks.ray_service import ray_service
 from tests.benchmarks.timing import spread
 from tests.checkpointing import Silent
 
@@ -91,27 +87,24 @@ class Told(Silent):
 
 def service_rows(config: RunConfig) -> list[tuple[str, list[float]]]:
     """Milliseconds that the loop stood still for each checkpoint, and gaps between updates with and without one."""
-    cluster, told = ray_cluster(config, 0, Place()), Told()
+    told = Told()
     stalls, quiet, writing = [], [], []
     last = (0.0, 0)
-    try:
-        with tempfile.TemporaryDirectory() as folder, closing(Journal(Path(folder) / "m.jsonl", 0)) as journal:
+    with ray_service(config) as make_loop:
 
-            def stop() -> bool:
-                nonlocal last
-                now_s = time.perf_counter()
-                if loop.updates > last[1]:
-                    if last[1]:
-                        (writing if loop._saver._checkpointer.is_busy else quiet).append(1000 * (now_s - last[0]))
-                    last = (now_s, loop.updates)
-                return told.written >= CHECKPOINTS
+        def stop() -> bool:
+            nonlocal last
+            now_s = time.perf_counter()
+            if loop.updates > last[1]:
+                if last[1]:
+                    (writing if loop._saver._checkpointer.is_busy else quiet).append(1000 * (now_s - last[0]))
+                last = (now_s, loop.updates)
+            return told.written >= CHECKPOINTS
 
-            loop = TrainingLoop(config, cluster, journal, Path(folder) / "checkpoints", told, stop)
-            begin = loop.checkpoint
-            loop.checkpoint = lambda: stalls.append(milliseconds(begin))
-            loop.run()
-    finally:
-        cluster.close()
+        loop = make_loop(told, stop)
+        begin = loop.checkpoint
+        loop.checkpoint = lambda: stalls.append(milliseconds(begin))
+        loop.run()
     return [
         ("the loop settles and snapshots", stalls),
         ("between two calls of updates, no checkpoint", quiet),

@@ -17,7 +17,8 @@ import numpy as np
 
 import sim_core  # noqa: F401  registers our environment, in whatever process this is
 from actors.evaluator import evaluate
-from actors.network import WeightsSnapshot
+from actors.network import WeightsSnapshot, snapshot
+from actors.vector_env import EnvSpec
 from learner.config import RunConfig, from_dict, to_dict
 from learner.results import score, summarise
 
@@ -86,13 +87,13 @@ class Lap:
     def _now_s(self) -> float:
         return time.perf_counter() - self._start_s - self._judged_s
 
-    def over(self, env_steps: int, updates: int, weights: Callable[[], list[np.ndarray]] | None = None) -> bool:
+    def over(self, env_steps: int, updates: int, weights: Callable[[], WeightsSnapshot] | None = None) -> bool:
         """Takes note of where the training stands; whether it may end.
 
         Args:
           env_steps, updates: so far.
-          weights: gives the policy as the weights and biases of its layers in turn, for the judge; None where the
-            training has a judge of its own, which calls `judged`.
+          weights: gives the policy for the judge; None where the training has a judge of its own, which calls
+            `judged`.
         """
         now_s = self._now_s()
         if updates and (not self._marks or now_s >= self._marks[-1][0] + 0.05):
@@ -104,11 +105,11 @@ class Lap:
             self._judge(weights())
         return self._reached_s is not None or now_s >= self._heat.seconds
 
-    def _judge(self, arrays: list[np.ndarray]) -> None:
+    def _judge(self, weights: WeightsSnapshot) -> None:
         start_s = time.perf_counter()
         config = self._heat.config
         seeds = list(range(JUDGED_FROM, JUDGED_FROM + config.eval_episodes))
-        found = score(summarise(evaluate(config.env, WeightsSnapshot(0, 0.0, tuple(arrays)), seeds)))
+        found = score(summarise(evaluate(config.env, weights, seeds)))
         self._judged_s += time.perf_counter() - start_s
         self.judged(found)
 
@@ -140,17 +141,14 @@ def compete(train: Callable[[Heat], Finding]) -> None:
     print(json.dumps(train(heat_of(sys.argv[1]))._asdict()))
 
 
-def layers_of(network: Any) -> list[np.ndarray]:
-    """Weights and biases of a PyTorch network's linear layers in the order in which it has them."""
-    import torch
-
-    linear = [module for module in network.modules() if isinstance(module, torch.nn.Linear)]
-    return [parameter.detach().cpu().numpy().copy() for module in linear for parameter in (module.weight, module.bias)]
+def policy_of(network: Any) -> WeightsSnapshot:
+    """A peer's Q-network for the judge: a PyTorch module whose parameters are those of our plain network."""
+    return snapshot(network, 0, 0.0)
 
 
-def float_env(env_id: str) -> gym.Env:
+def float_env(spec: EnvSpec) -> gym.Env:
     """One environment whose observations are float32, for libraries whose networks take nothing else."""
-    return gym.wrappers.DtypeObservation(gym.make(env_id), np.float32)
+    return gym.wrappers.DtypeObservation(gym.make(spec.env_id, **spec.settings), np.float32)
 
 
 class Rhythm(NamedTuple):

@@ -27,10 +27,11 @@ from learner.config import RunConfig, from_dict
 from learner.ray_auth import guard_ray
 from sim_core.config import WorldConfig
 from tests.benchmarks.contest import Finding, Heat
-from tests.benchmarks.timing import Spread, ratio, spread
+from tests.benchmarks.timing import ratio, spread
 
 ROOT = Path(__file__).parents[2]
 OURS = "shoal"
+PEERS = ("Stable-Baselines3", "TorchRL", "RLlib")
 SWEEP_S = 6.0
 
 
@@ -61,10 +62,9 @@ class Style(NamedTuple):
 
 
 class Contender(NamedTuple):
-    """Who trains: a module of `contenders`, the library that it needs, and the interpreter that has it."""
+    """Who trains: a module of `contenders`, and the interpreter that has what it needs."""
 
     module: str
-    library: str
     python: str = sys.executable
 
     def styles(self, contest: Contest) -> list[Style]:
@@ -107,7 +107,7 @@ def contests() -> dict[str, Contest]:
 
 def contenders(rllib: Path | None, console: Console) -> dict[str, Contender]:
     """Those that can take part; the others are named."""
-    found = {OURS: Contender("shoal", "ray")}
+    found = {OURS: Contender("shoal")}
     for name, module, library in (
         ("Stable-Baselines3", "sb3", "stable_baselines3"),
         ("TorchRL", "torchrl", "torchrl"),
@@ -115,11 +115,11 @@ def contenders(rllib: Path | None, console: Console) -> dict[str, Contender]:
         if importlib.util.find_spec(library) is None:
             console.print(f"{name}: not installed (the extra `peers`), left out")
         else:
-            found[name] = Contender(module, library)
+            found[name] = Contender(module)
     if rllib is None:
         console.print("RLlib: no --rllib PYTHON with it, left out")
     else:
-        found["RLlib"] = Contender("rllib", "ray", str(rllib))
+        found["RLlib"] = Contender("rllib", str(rllib))
     return found
 
 
@@ -191,16 +191,14 @@ def threshold_table(contest: Contest, found: dict[Entry, list[Finding]], limit_s
     table = Table(title=f"{contest.title}: seconds to {contest.threshold:g}, median (lowest … highest)")
     for column in ("contender", "its best", "reached", "seconds", "with start-up", "env steps", "it / shoal"):
         table.add_column(column, justify="left" if column in ("contender", "its best") else "right")
-    ours = [
-        seconds_of(finding, limit_s) for entry, findings in found.items() if entry.name == OURS for finding in findings
-    ]
+    waits = {entry.name: [seconds_of(finding, limit_s) for finding in findings] for entry, findings in found.items()}
     for entry, findings in found.items():
-        seconds = [seconds_of(finding, limit_s) for finding in findings]
+        seconds = waits[entry.name]
         reached = sum(finding.to_threshold_s is not None for finding in findings)
         least = "" if reached == len(findings) else "≥ "
         whole = spread([one + finding.start_up_s for one, finding in zip(seconds, findings, strict=True)])
         env_steps = spread([finding.env_steps for finding in findings])
-        against: Spread | None = None if entry.name == OURS else ratio(seconds, ours)
+        against = "" if entry.name == OURS else least + ratio(seconds, waits[OURS]).text(1)
         table.add_row(
             entry.name,
             entry.style.text(),
@@ -208,7 +206,7 @@ def threshold_table(contest: Contest, found: dict[Entry, list[Finding]], limit_s
             least + spread(seconds).text(1),
             least + whole.text(1),
             env_steps.text(),
-            "" if against is None else least + against.text(1),
+            against,
         )
     return table
 
@@ -222,19 +220,22 @@ def hold(contest: Contest, field: dict[str, Contender], options: argparse.Namesp
     """Runs one contest and prints its tables."""
     console.print(contest.title)
     entries = [fastest(name, contender, contest, console) for name, contender in field.items()]
+    seeds = [dataclasses.replace(contest.config, seed=seed) for seed in range(options.rounds)]
+    console.print(rate_table(contest, in_turn(entries, [contest.config] * options.rounds, options.seconds, None)))
+    if contest.threshold is not None:
+        found = in_turn(entries, seeds, options.limit_s, contest.threshold)
+        console.print(threshold_table(contest, found, options.limit_s))
+
+
+def in_turn(
+    entries: list[Entry], rounds: list[RunConfig], seconds: float, threshold: float | None
+) -> dict[Entry, list[Finding]]:
+    """What each contender found in every round, one after the other, so that the machine drifts for all alike."""
     found: dict[Entry, list[Finding]] = {entry: [] for entry in entries}
-    for _ in range(options.rounds):
+    for config in rounds:
         for entry in entries:
-            found[entry].append(entry.run(contest.config, options.seconds, None))
-    console.print(rate_table(contest, found))
-    if contest.threshold is None:
-        return
-    timed: dict[Entry, list[Finding]] = {entry: [] for entry in entries}
-    for seed in range(options.rounds):
-        config = dataclasses.replace(contest.config, seed=seed)
-        for entry in entries:
-            timed[entry].append(entry.run(config, options.limit_s, contest.threshold))
-    console.print(threshold_table(contest, timed, options.limit_s))
+            found[entry].append(entry.run(config, seconds, threshold))
+    return found
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -242,7 +243,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.peers", description=__doc__)
     parser.add_argument("contests", nargs="*", help=f"of {', '.join(known)}; default: all")
     parser.add_argument("--rllib", type=Path, metavar="PYTHON", help="an interpreter with shoal and ray[rllib]")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="contenders, such as shoal Stable-Baselines3")
+    parser.add_argument("--only", nargs="+", choices=PEERS, help="the peers beside shoal; default: all")
     parser.add_argument("--rounds", type=int, default=3, help="of every measurement; of the threshold, seeds")
     parser.add_argument("--seconds", type=float, default=15.0, help="that a rate is measured for")
     parser.add_argument("--limit-s", type=float, default=600.0, help="after which a threshold counts as not reached")
@@ -250,6 +251,8 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     for name in options.contests:
         if name not in known:
             parser.error(f"no contest {name!r}; there are: {', '.join(known)}")
+    if options.rllib is not None and not options.rllib.is_file():
+        parser.error(f"--rllib: there is no file {options.rllib}")
     return options
 
 
@@ -259,7 +262,7 @@ def main() -> int:
     console = Console(width=160)
     field = contenders(options.rllib, console)
     if options.only:
-        field = {name: contender for name, contender in field.items() if name in options.only}
+        field = {name: contender for name, contender in field.items() if name in (OURS, *options.only)}
     for name, contest in contests().items():
         if not options.contests or name in options.contests:
             hold(contest, field, options, console)

@@ -1,9 +1,6 @@
 """Where the time goes: the bare simulator, the rollout worker, the learner, and the whole service over Ray."""
 
-import tempfile
 import time
-from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -15,11 +12,8 @@ from actors.transitions import transition_dtype
 from actors.vector_env import env_shape, make_vector_env
 from learner.cluster import learner_settings, rollout_settings
 from learner.config import RunConfig
-from learner.journal import Journal
 from learner.learner import Learner
-from learner.loop import TrainingLoop
-from learner.place import Place
-from learner.ray_edge import ray_cluster
+from tests.benchmarks.ray_service import ray_service
 from tests.benchmarks.timing import rates, ratio, spread
 from tests.checkpointing import Silent
 
@@ -67,20 +61,16 @@ def learner_work(config: RunConfig):
 
 def service_rates(config: RunConfig) -> tuple[float, float]:
     """(env steps/s, updates/s) of the whole service in its steady state."""
-    cluster = ray_cluster(config, 0, Place())
     marks: list[tuple[float, int, int]] = []
-    try:
-        with tempfile.TemporaryDirectory() as folder, closing(Journal(Path(folder) / "m.jsonl", 0)) as journal:
+    with ray_service(config) as make_loop:
 
-            def stop() -> bool:
-                if loop.updates and (not marks or time.perf_counter() - marks[0][0] < SERVICE_S):
-                    marks.append((time.perf_counter(), loop.env_steps, loop.updates))
-                return bool(marks) and time.perf_counter() - marks[0][0] >= SERVICE_S
+        def stop() -> bool:
+            if loop.updates and (not marks or time.perf_counter() - marks[0][0] < SERVICE_S):
+                marks.append((time.perf_counter(), loop.env_steps, loop.updates))
+            return bool(marks) and time.perf_counter() - marks[0][0] >= SERVICE_S
 
-            loop = TrainingLoop(config, cluster, journal, Path(folder) / "checkpoints", Silent(), stop)
-            loop.run()
-    finally:
-        cluster.close()
+        loop = make_loop(Silent(), stop)
+        loop.run()
     (start_s, start_steps, start_updates), (end_s, end_steps, end_updates) = marks[0], marks[-1]
     elapsed_s = end_s - start_s
     return (end_steps - start_steps) / elapsed_s, (end_updates - start_updates) / elapsed_s

@@ -30,6 +30,8 @@ FLAT_SHARE_PER_H = 0.01
 FLAT_MB_PER_H = 2.0
 LEFT_S = 30.0
 """What the run started must have ended so long after it."""
+UNDER_WAY = ("references", "objects in the store")
+"""Kinds that are no processes: their number goes up and down with what is under way at a look."""
 STORE = "num local plasma objects: "
 """The line of the raylet's own report with the objects in the node's store."""
 
@@ -107,8 +109,8 @@ class Sampler(threading.Thread):
             writer.writerow(Usage._fields)
             while (now_s := time.monotonic() - start_s) < self._seconds:
                 held, stored = references()
-                found = [*usage(now_s), Usage(now_s, "references", held, 0.0, 0, 0)]
-                found.append(Usage(now_s, "objects in the store", stored, 0.0, 0, 0))
+                counted = zip(UNDER_WAY, (held, stored), strict=True)
+                found = [*usage(now_s), *(Usage(now_s, kind, count, 0.0, 0, 0) for kind, count in counted)]
                 self.samples += found
                 writer.writerows(found)
                 file.flush()
@@ -132,12 +134,12 @@ def row(kind: str, series: list[Usage], quarter_s: float) -> tuple[list[str], bo
     words, flat = [kind], True
     for name in ("processes", "handles", "threads", "megabytes"):
         before, after = (float(np.median([getattr(sample, name) for sample in part])) for part in (early, late))
-        slope, low, high = growth(settled, name)
         if name == "megabytes":
+            slope, low, high = growth(settled, name)
             flat &= low <= max(FLAT_SHARE_PER_H * before, FLAT_MB_PER_H)
             words += [f"{before:,.1f} → {after:,.1f}", f"{slope:+.2f} ({low:+.2f} … {high:+.2f})"]
         else:
-            flat &= after - before < 1 or low <= 0  # what is under way at a look goes up and down
+            flat &= after - before < 1 or (kind in UNDER_WAY and growth(settled, name)[1] <= 0)
             words.append(f"{before:g} → {after:g}")
     return [*words, "yes" if flat else "NO"], flat
 

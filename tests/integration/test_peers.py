@@ -7,12 +7,12 @@ import pytest
 import torch
 from stable_baselines3.common.env_util import make_vec_env
 
-from actors.network import Policy, QNetwork, WeightsSnapshot
-from actors.vector_env import make_vector_env
+from actors.network import Policy, QNetwork
+from actors.vector_env import env_shape, make_vector_env
 from learner.config import RunConfig
 from tests.benchmarks import contest, peers
 from tests.benchmarks.contenders.sb3 import Vectorised
-from tests.benchmarks.contest import Heat, Lap, heat_of, layers_of, rhythm, target_every_env_steps
+from tests.benchmarks.contest import Heat, Lap, float_env, heat_of, policy_of, rhythm, target_every_env_steps
 
 CARTPOLE = peers.contests()["cartpole"].config
 
@@ -54,12 +54,13 @@ def test_rates_are_counted_from_after_the_warm_up_and_for_the_time_asked(clock):
 def test_the_watch_stands_still_while_the_judge_plays(clock, monkeypatch):
     scores = iter([0.2, 0.9])
 
-    def judge(self, weights):
+    def play(spec, weights, seeds):
         clock.now_s += 50
-        self._judged_s += 50
-        self.judged(next(scores))
+        return next(scores)
 
-    monkeypatch.setattr(Lap, "_judge", judge)
+    monkeypatch.setattr(contest, "evaluate", play)
+    monkeypatch.setattr(contest, "summarise", lambda stats: stats)
+    monkeypatch.setattr(contest, "score", lambda evaluation: evaluation)
     lap = Lap(heat(threshold=0.85))
     for step in range(1, 5):
         clock.now_s += 1
@@ -71,13 +72,13 @@ def test_the_watch_stands_still_while_the_judge_plays(clock, monkeypatch):
 def test_the_judge_scores_the_network_that_it_is_given():
     torch.manual_seed(0)
     network = QNetwork(16, (32, 32), 8)
-    layers = layers_of(network)
+    weights = policy_of(network)
     observation = np.random.default_rng(0).normal(size=(5, 16)).astype(np.float32)
     expected = network(torch.from_numpy(observation)).detach().numpy()
-    found = Policy(WeightsSnapshot(0, 0.0, tuple(layers))).values(observation)
+    found = Policy(weights).values(observation)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
     lap = Lap(heat(threshold=2.0))
-    assert not lap.over(1000, 1, lambda: layers)
+    assert not lap.over(1000, 1, lambda: weights)
     assert 0.0 <= lap.finding().score <= 1.0
 
 
@@ -101,8 +102,8 @@ def test_a_heat_travels_as_json():
 
 def test_the_vectorised_environment_does_as_stable_baselines3s_own():
     ours, theirs = Vectorised(make_vector_env(CARTPOLE.env, 3)), make_vec_env("CartPole-v1", 3, seed=5)
-    start = ours.env.reset(seed=[5, 6, 7])[0]
-    np.testing.assert_array_equal(start, theirs.reset())
+    ours.seed(5)
+    np.testing.assert_array_equal(ours.reset(), theirs.reset())
     actions, ended = np.random.default_rng(0).integers(2, size=(120, 3)), 0
     for action in actions:
         found, expected = ours.step(action), theirs.step(action)
@@ -117,11 +118,17 @@ def test_the_vectorised_environment_does_as_stable_baselines3s_own():
     ours.close()
 
 
+def test_peers_get_the_world_that_is_set():
+    spec = peers.contests()["wide"].config.env
+    shape = env_shape(spec).observation_space.shape
+    assert float_env(spec).observation_space.shape == shape == (72,)
+
+
 @pytest.mark.ray
 @pytest.mark.slow
 @pytest.mark.parametrize("module", ["shoal", "sb3"])
 def test_contenders_draw_as_many_samples_per_insert_as_they_are_told(module):
-    contender = peers.Contender(module, "")
+    contender = peers.Contender(module)
     found = peers.run_heat(contender, Heat(CARTPOLE, 16, 1, 2.0, None))
     drawn = found.updates_per_s * CARTPOLE.batch_size / found.env_steps_per_s
     assert drawn == pytest.approx(CARTPOLE.samples_per_insert, rel=0.25)
@@ -131,5 +138,5 @@ def test_contenders_draw_as_many_samples_per_insert_as_they_are_told(module):
 def test_a_contender_that_fails_says_why():
     with pytest.raises(RuntimeError, match=r"(?s)sb3 failed: .*Environment `nothing` doesn't exist"):
         peers.run_heat(
-            peers.Contender("sb3", ""), Heat(dataclasses.replace(CARTPOLE, env_id="nothing-v0"), 1, 1, 1.0, None)
+            peers.Contender("sb3"), Heat(dataclasses.replace(CARTPOLE, env_id="nothing-v0"), 1, 1, 1.0, None)
         )

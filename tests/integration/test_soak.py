@@ -36,6 +36,7 @@ def test_a_count_that_goes_up_and_down_is_flat_however_its_quarters_compare():
     [
         {"megabytes": lambda i: 300.0 + 6.0 * i / (2 * QUARTER)},  # 6 MB an hour
         {"handles": lambda i: 40 + i // QUARTER},
+        {"handles": lambda i: 40 + (i > 3.2 * QUARTER)},  # a single one that stays
         {"threads": lambda i: 9 + i // QUARTER},
         {"processes": lambda i: 1 + i // QUARTER},
     ],

@@ -5,16 +5,16 @@ from ray.rllib.algorithms.dqn import DQNConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.tune import register_env
 
-from tests.benchmarks.contest import Finding, Heat, Lap, compete, float_env, layers_of, target_every_env_steps
+from tests.benchmarks.contest import Finding, Heat, Lap, compete, float_env, policy_of, target_every_env_steps
 
 
 def algorithm(heat: Heat):
     config = heat.config
-    register_env("contest", lambda settings: float_env(settings["env_id"]))
+    register_env("contest", lambda _: float_env(config.env))
     buffer = {"type": "EpisodeReplayBuffer", "capacity": config.replay_capacity}
     return (
         DQNConfig()
-        .environment("contest", env_config={"env_id": config.env_id})
+        .environment("contest")
         .env_runners(num_env_runners=1, num_envs_per_env_runner=heat.envs)
         .rl_module(
             model_config=DefaultModelConfig(
@@ -55,7 +55,7 @@ def train(heat: Heat) -> Finding:
         result = made.train()
         env_steps = int(result["env_runners"].get("num_env_steps_sampled_lifetime", 0))
         trained = result.get("learners", {}).get("__all_modules__", {}).get("num_env_steps_trained_lifetime", 0)
-        over = lap.over(env_steps, int(trained) // heat.config.batch_size, lambda: layers_of(made.get_module()))
+        over = lap.over(env_steps, int(trained) // heat.config.batch_size, lambda: policy_of(made.get_module()))
     made.stop()
     ray.shutdown()
     return lap.finding()

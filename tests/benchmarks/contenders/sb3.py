@@ -8,10 +8,10 @@ import torch
 from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 
-from actors.vector_env import final_observations, make_vector_env
-from tests.benchmarks.contest import Finding, Heat, Lap, compete, layers_of, rhythm, target_every_env_steps
+from actors.vector_env import final_observations, make_vector_env, reset_seeded
+from tests.benchmarks.contest import Finding, Heat, Lap, compete, policy_of, rhythm, target_every_env_steps
 
 
 class Vectorised(VecEnv):
@@ -23,7 +23,9 @@ class Vectorised(VecEnv):
         self.action: np.ndarray | None = None
 
     def reset(self):
-        return self.env.reset(seed=None)[0]
+        seeds = self._seeds
+        self._reset_seeds()
+        return reset_seeded(self.env, seeds)
 
     def step_async(self, actions: np.ndarray) -> None:
         self.action = actions
@@ -63,7 +65,7 @@ class Watch(BaseCallback):
 
     def _on_step(self) -> bool:
         updates = self.model._n_updates
-        return not self.lap.over(self.num_timesteps, updates, lambda: layers_of(self.model.q_net))
+        return not self.lap.over(self.num_timesteps, updates, lambda: policy_of(self.model.q_net))
 
 
 def train(heat: Heat) -> Finding:
@@ -72,7 +74,7 @@ def train(heat: Heat) -> Finding:
     if heat.variant == "vectorised":
         env: VecEnv = Vectorised(make_vector_env(config.env, heat.envs))
     else:
-        env = make_vec_env(config.env_id, heat.envs, seed=config.seed, vec_env_cls=DummyVecEnv)
+        env = make_vec_env(config.env_id, heat.envs, seed=config.seed, env_kwargs=config.env.settings)
     beat = rhythm(config, heat.envs)
     change = config.learning_rate_end - config.learning_rate
     model = DQN(

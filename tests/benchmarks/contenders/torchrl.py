@@ -8,7 +8,7 @@ from torchrl.envs import GymWrapper, SerialEnv
 from torchrl.modules import MLP, EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, HardUpdate
 
-from tests.benchmarks.contest import Finding, Heat, Lap, compete, float_env, layers_of, rhythm
+from tests.benchmarks.contest import Finding, Heat, Lap, compete, float_env, policy_of, rhythm
 
 
 def train(heat: Heat) -> Finding:
@@ -17,7 +17,7 @@ def train(heat: Heat) -> Finding:
     torch.manual_seed(config.seed)
 
     def make():
-        return GymWrapper(float_env(config.env_id), categorical_action_encoding=True)
+        return GymWrapper(float_env(config.env), categorical_action_encoding=True)
 
     env = SerialEnv(heat.envs, make)
     env.set_seed(config.seed)
@@ -63,7 +63,7 @@ def train(heat: Heat) -> Finding:
                 optimizer.zero_grad()
                 target.step()
                 updates += 1
-        if lap.over(env_steps, updates, lambda: layers_of(network)):
+        if lap.over(env_steps, updates, lambda: policy_of(network)):
             break
     collector.shutdown()
     return lap.finding()
