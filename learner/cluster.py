@@ -15,8 +15,8 @@ from actors.rollout import RolloutSettings
 from actors.transitions import transition_dtype
 from actors.vector_env import EnvShape, env_shape
 from learner.config import RunConfig
-from learner.learner import LearnerSettings
 from learner.node import LearnerNode
+from learner.updates import LearnerSettings
 
 
 class Cluster(NamedTuple):

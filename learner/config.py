@@ -110,7 +110,7 @@ class RunConfig:
     max_gradient_norm: float = 10.0
     """Gradients are scaled down to this norm."""
     gradients: Literal["by_hand", "autograd"] = "by_hand"
-    """Gradients of the update written out, or by PyTorch's autograd: the same to rounding, by hand faster."""
+    """The update's gradients written out (compiled where they can be), or by PyTorch's autograd; the same to rounding."""
 
     eval_every_env_steps: int = 250_000
     """Env steps between two evaluations during training."""

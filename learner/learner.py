@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -10,39 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from actors.network import NETWORKS, WeightsSnapshot, snapshot
-from learner.double_dqn import Batch, LossName, as_batch
-from learner.gradients import GRADIENTS, FlatNetwork, Measured
+from learner.compiled import CompiledUpdates
+from learner.gradients import FlatNetwork
+from learner.updates import LearnerSettings, TorchUpdates, Updates, UpdateStats
 from sim_core.checks import require
-
-
-class LearnerSettings(NamedTuple):
-    """What the learner needs to know of the run.
-
-    With a `soft_target_rate` the target network follows the online network after every update (Polyak's average),
-    without one it is copied every `target_update_interval`.
-    """
-
-    observation_size: int
-    num_actions: int
-    hidden_sizes: tuple[int, ...]
-    double: bool
-    batch_size: int
-    target_update_interval: int
-    max_gradient_norm: float
-    gradients: Literal["by_hand", "autograd"]
-    seed: int
-    network: Literal["plain", "dueling"]
-    loss: LossName
-    soft_target_rate: float | None
-    device: Literal["auto", "cpu", "cuda"]
-
-
-class UpdateStats(NamedTuple):
-    """Means over the updates of one call."""
-
-    loss: float
-    q_mean: float
-    td_error: float
 
 
 class Learner:
@@ -59,7 +30,6 @@ class Learner:
     """
 
     def __init__(self, settings: LearnerSettings) -> None:
-        self._settings = settings
         with torch.random.fork_rng():
             torch.manual_seed(settings.seed)
             online = NETWORKS[settings.network](settings.observation_size, settings.hidden_sizes, settings.num_actions)
@@ -67,9 +37,12 @@ class Learner:
         self._online = FlatNetwork(online.to(self.device))
         self._target = self._online.copy()
         self.online, self.target = self._online.network, self._target.network
-        self._gradients = GRADIENTS[settings.gradients](self._online, self._target, settings.double, settings.loss)
         self.optimiser = torch.optim.Adam([self._online.values], fused=True)
+        plain = settings.gradients == "by_hand" and settings.network == "plain" and self.device.type == "cpu"
+        ways = CompiledUpdates if plain else TorchUpdates
+        self._make: Updates = ways(self._online, self._target, self.optimiser, settings)
         self.updates = 0
+        self._batch_size = settings.batch_size
         self._columns = Columns()
         self.td_errors = np.zeros(0, np.float32)
 
@@ -83,37 +56,12 @@ class Learner:
           learning_rate: Adam's.
           weights: what each row's loss counts, `[rows]`, None for 1.
         """
-        for group in self.optimiser.param_groups:
-            group["lr"] = learning_rate
-        columns = {name: column.to(self.device) for name, column in self._columns(rows).items()}
+        columns = self._columns(rows)
         if weights is not None:
-            columns["weight"] = torch.from_numpy(weights).to(self.device)
-        size = self._settings.batch_size
-        sums = torch.zeros(3, device=self.device)
-        errors = torch.empty(len(rows), device=self.device)
-        starts = range(0, len(rows), size)
-        for start in starts:
-            part = slice(start, start + size)
-            *means, errors[part] = self._step(as_batch(columns, part))
-            sums += torch.stack(means)
-        self.td_errors = errors.cpu().numpy()
-        loss, q_mean, td_error = (sums / len(starts)).tolist()
-        return UpdateStats(loss, q_mean, td_error)
-
-    def _step(self, batch: Batch) -> Measured:
-        measured = self._gradients(batch)
-        self._online.clip_gradients(self._settings.max_gradient_norm)
-        self.optimiser.step()
-        self.updates += 1
-        self._update_target()
-        return measured
-
-    def _update_target(self) -> None:
-        online, target, rate = self._online.values.data, self._target.values.data, self._settings.soft_target_rate
-        if rate is not None:
-            target.lerp_(online, rate)
-        elif self.updates % self._settings.target_update_interval == 0:
-            target.copy_(online)
+            columns["weight"] = torch.from_numpy(weights)
+        stats, self.td_errors = self._make(columns, learning_rate, self.updates)
+        self.updates += len(rows) // self._batch_size
+        return stats
 
     def weights(self, time_s: float) -> WeightsSnapshot:
         """The online network, for publication."""

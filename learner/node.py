@@ -18,7 +18,8 @@ from actors.nodes import ShardNode
 from actors.parts import PartWriter, Written, join_written
 from actors.transitions import AddReply, Delivered, Draws, SampleReply, TransitionBlock
 from learner.double_dqn import importance_weights
-from learner.learner import Learner, LearnerSettings, UpdateStats
+from learner.learner import Learner
+from learner.updates import LearnerSettings, UpdateStats
 
 SLOW_CALL_S = 3_600.0
 WEIGHTS = "learner.safetensors"

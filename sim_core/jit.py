@@ -41,7 +41,7 @@ def _compiled(function: Any, **options: Any) -> Any:
     theirs = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = _FOLDER  # read while the kernel is made; other users of numba keep their setting
     try:
-        return njit(**JIT_OPTIONS, **options)(function)
+        return njit(**(JIT_OPTIONS | options))(function)
     finally:
         numba.config.CACHE_DIR = theirs
 
@@ -54,3 +54,8 @@ def kernel(function: Any) -> Any:
 def inlined(function: Any) -> Any:
     """Compiles `function` as a part of the kernels that call it, each of which takes it in whole."""
     return _compiled(function, forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
+def product(function: Any) -> Any:
+    """Compiles `function` as `inlined` does, but with numba's run-time: `np.dot`, numba's way to BLAS, needs it."""
+    return _compiled(function, forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=True)

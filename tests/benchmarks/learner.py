@@ -1,6 +1,7 @@
-"""Updates a second of the learner on one thread, beside the same update in plain PyTorch."""
+"""Updates a CPU second of the learner on one thread, beside the same update in plain PyTorch."""
 
 import copy
+import time
 
 import numpy as np
 import torch
@@ -11,8 +12,9 @@ from rich.table import Table
 from actors.network import QNetwork
 from actors.transitions import transition_dtype
 from learner.double_dqn import as_batch, mean_loss, targets
-from learner.learner import Columns, Learner, LearnerSettings
-from tests.benchmarks.timing import rates, ratio, spread
+from learner.learner import Columns, Learner
+from learner.updates import LearnerSettings
+from tests.benchmarks.timing import ratio, spread, stopwatch, timed_rates
 
 SHAPES = (((16, 64, 64, 8), 64), ((16, 64, 64, 8), 256), ((16, 128, 128, 8), 256), ((72, 128, 128, 9), 256))
 SHAPES += (((72, 256, 256, 9), 256), ((72, 256, 256, 9), 512))
@@ -78,12 +80,13 @@ def plain_work(rows: np.ndarray, sizes: tuple[int, ...], batch: int):
 
 def main() -> None:
     torch.set_num_threads(1)
-    table = Table(title=f"updates/s of Double DQN, one thread, median (lowest … highest) of {ROUNDS}")
+    table = Table(title=f"updates per CPU second of Double DQN, one thread, median (lowest … highest) of {ROUNDS}")
     for column in ("network", "batch", "shoal", "eager PyTorch, fused Adam", "ratio"):
         table.add_column(column, justify="right")
     for sizes, batch in SHAPES:
         rows = random_rows(UPDATES * batch, sizes[0], sizes[-1])
-        found = rates({"own": our_work(rows, sizes, batch), "plain": plain_work(rows, sizes, batch)}, ROUNDS)
+        works = {"own": our_work(rows, sizes, batch), "plain": plain_work(rows, sizes, batch)}
+        found = timed_rates({name: stopwatch(work, time.process_time) for name, work in works.items()}, ROUNDS)
         ours, theirs = found["own"], found["plain"]
         numbers = (spread(ours).text(), spread(theirs).text(), ratio(ours, theirs).text(2))
         table.add_row("-".join(map(str, sizes)), str(batch), *numbers)

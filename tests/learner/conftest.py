@@ -7,7 +7,7 @@ import torch
 
 from actors.transitions import transition_dtype
 from learner.config import RunConfig
-from learner.learner import LearnerSettings
+from learner.updates import LearnerSettings
 from sim_core.config import WorldConfig
 
 ROW = transition_dtype(gym.spaces.Box(-100, 100, (3,), np.float32))

@@ -9,7 +9,8 @@ import torch
 
 from actors.network import Policy
 from actors.transitions import transition_dtype
-from learner.learner import Columns, Learner, LearnerSettings, learning_device
+from learner.learner import Columns, Learner, learning_device
+from learner.updates import LearnerSettings
 from sim_core.checks import ConfigError
 
 RATE = 2e-3

@@ -7,9 +7,9 @@ import pytest
 
 from actors.transitions import BlockHeader, BlockReport, EpisodeStats
 from learner import meters as meters_module
-from learner.learner import UpdateStats
 from learner.meters import Meters
 from learner.node import UpdateReport
+from learner.updates import UpdateStats
 
 
 def report(outcomes, returns, lengths, env_steps=100, staleness_updates=0, staleness_s=0.0, rate=0.5):
