@@ -110,7 +110,7 @@ class RunConfig:
     max_gradient_norm: float = 10.0
     """Gradients are scaled down to this norm."""
     gradients: Literal["by_hand", "autograd"] = "by_hand"
-    """The update's gradients written out (compiled where they can be), or by PyTorch's autograd; the same to rounding."""
+    """The update's gradients written out, compiled where they can be, or by PyTorch's autograd: equal to rounding."""
 
     eval_every_env_steps: int = 250_000
     """Env steps between two evaluations during training."""
