@@ -1,6 +1,6 @@
-"""The Q-network: in torch where it learns, in numpy where it acts.
+"""The Q-network: in torch, and compiled where it acts.
 
-A rollout worker's batches are small, where numpy is several times faster than torch and needs no torch
+A rollout worker's batches are small, where a compiled kernel is several times faster than torch and needs no torch
 in the worker's process; both compute the same function (tested).
 """
 
@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from actors.perceptron import Floats, Layers, best_of, forward, make_room
 from sim_core.jit import kernel
 
 
@@ -120,9 +121,9 @@ def load_snapshot(network: QNetwork, weights: WeightsSnapshot) -> None:
 
 
 class Policy:
-    """Action values in numpy from published weights.
+    """Action values from published weights, compiled.
 
-    Hidden layers lie in memory that is kept between calls: to ask for it anew costs as much as what is written to it.
+    Layers lie in memory that is kept between calls: to ask for it anew costs as much as what is written to it.
 
     Args:
       weights: the snapshot to act with.
@@ -130,39 +131,37 @@ class Policy:
 
     def __init__(self, weights: WeightsSnapshot) -> None:
         self.weights = weights
-        arrays = weights.arrays
-        self._layers = [(matrix.T.copy(), bias) for matrix, bias in zip(arrays[::2], arrays[1::2], strict=True)]
-        self._seen = np.empty((0, 0), np.float32)
-        self._hidden: list[NDArray[np.float32]] = []
+        copies = [array.copy() for array in weights.arrays]  # what Ray gives is read-only, another type to numba
+        self._layers = Layers(tuple(copies[::2]), tuple(copies[1::2]))
+        self._room = make_room(0, self._layers)
 
     def values(self, observation: NDArray[np.generic]) -> NDArray[np.float32]:
         """Action values `[batch, actions]` of observations `[batch, *shape]`."""
-        count = len(observation)
-        if len(self._seen) != count:
-            self._seen = np.empty((count, len(self._layers[0][0])), np.float32)
-            self._hidden = [np.empty((count, len(bias)), np.float32) for _, bias in self._layers[:-1]]
-        x = self._seen
-        x[...] = observation.reshape(count, -1)
-        for (matrix, bias), out in zip(self._layers, self._hidden, strict=False):
-            np.dot(x, matrix, out=out)
-            _shift_and_rectify(out, bias)
-            x = out
-        matrix, bias = self._layers[-1]
-        values: NDArray[np.float32] = np.dot(x, matrix)
-        values += bias
-        return values
+        self._see(observation)
+        _values(self._layers, self._room)
+        return self._room[-1].copy()
 
     def greedy(self, observation: NDArray[np.generic]) -> NDArray[np.int64]:
         """Best actions `[batch]`; the lowest index among equals."""
-        best: NDArray[np.int64] = np.argmax(self.values(observation), axis=1)
-        return best
+        self._see(observation)
+        actions = np.empty(len(observation), np.int64)
+        _greedy(self._layers, self._room, actions)
+        return actions
+
+    def _see(self, observation: NDArray[np.generic]) -> None:
+        count = len(observation)
+        if len(self._room[0]) != count:
+            self._room = make_room(count, self._layers)
+        self._room[0][...] = observation.reshape(count, -1)
 
 
 @kernel
-def _shift_and_rectify(x: NDArray[np.float32], bias: NDArray[np.float32]) -> None:
-    """max(x + bias, 0) in place, in one pass where numpy takes two; NaN stays NaN."""
-    zero = np.float32(0)
-    for row in range(x.shape[0]):
-        for column in range(x.shape[1]):
-            value = x[row, column] + bias[column]
-            x[row, column] = zero if value <= zero else value
+def _values(layers: Layers, room: tuple[Floats, ...]) -> None:
+    forward(layers, room)
+
+
+@kernel
+def _greedy(layers: Layers, room: tuple[Floats, ...], actions: NDArray[np.int64]) -> None:
+    forward(layers, room)
+    for row in range(len(actions)):
+        actions[row] = best_of(room[-1], row)

@@ -15,11 +15,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from actors.perceptron import Floats, Layers, best_of, forward, make_room, multiply, square
 from learner.gradients import FlatNetwork
 from learner.updates import LearnerSettings, UpdateStats
-from sim_core.jit import inlined, kernel, product
-
-Floats = NDArray[np.float32]
+from sim_core.jit import inlined, kernel
 
 
 class _Rows(NamedTuple):
@@ -31,13 +30,6 @@ class _Rows(NamedTuple):
     discount_t: Floats
     s_t: Floats
     weight: Floats
-
-
-class _Layers(NamedTuple):
-    """Weights `[fan_out, fan_in]` and biases `[fan_out]` of all layers, or their gradients."""
-
-    weights: tuple[Floats, ...]
-    biases: tuple[Floats, ...]
 
 
 class _Flat(NamedTuple):
@@ -99,8 +91,7 @@ class CompiledUpdates:
             group["betas"][1],
             group["eps"],
         )
-        widths = [settings.observation_size, *settings.hidden_sizes, settings.num_actions]
-        seen, other = (tuple(np.zeros((self._size, width), np.float32) for width in widths) for _ in range(2))
+        seen, other = (make_room(self._size, self._layers) for _ in range(2))
         self._room = _Room(seen, other, *np.zeros((2, self._size), np.float32))
         self._compile(settings.observation_size)
 
@@ -148,17 +139,17 @@ class CompiledUpdates:
         return state
 
 
-def _arrays(layers: list[tuple[Tensor, Tensor]]) -> _Layers:
+def _arrays(layers: list[tuple[Tensor, Tensor]]) -> Layers:
     weights, biases = zip(*layers, strict=True)
-    return _Layers(tuple(weight.numpy() for weight in weights), tuple(bias.numpy() for bias in biases))
+    return Layers(tuple(weight.numpy() for weight in weights), tuple(bias.numpy() for bias in biases))
 
 
 @kernel
 def _updates(
     rows: _Rows,
-    online: _Layers,
-    target: _Layers,
-    slopes: _Layers,
+    online: Layers,
+    target: Layers,
+    slopes: Layers,
     flat: _Flat,
     room: _Room,
     rule: _Rule,
@@ -183,40 +174,17 @@ def _updates(
             _follow(flat.target, flat.values, np.float32(1))
 
 
-@product
-def _multiply(a: Floats, b: Floats, out: Floats) -> None:
-    np.dot(a, b, out)
-
-
-@product
-def _square(x: Floats) -> Any:
-    return np.dot(x, x)
-
-
 @inlined
-def _values(states: Floats, start: int, layers: _Layers, room: tuple[Floats, ...]) -> None:
+def _values(states: Floats, start: int, layers: Layers, room: tuple[Floats, ...]) -> None:
     """Writes a minibatch's states, hidden layers and action values to `room`."""
     for row in range(room[0].shape[0]):
         for column in range(room[0].shape[1]):
             room[0][row, column] = states[start + row, column]
-    last = len(layers.weights) - 1
-    for i in range(last + 1):
-        _multiply(room[i], layers.weights[i].T, room[i + 1])
-        _shift(room[i + 1], layers.biases[i], i < last)
+    forward(layers, room)
 
 
 @inlined
-def _shift(x: Floats, bias: Floats, rectify: bool) -> None:
-    """X + bias in place, or max(x + bias, 0), where NaN stays NaN."""
-    zero = np.float32(0)
-    for row in range(x.shape[0]):
-        for column in range(x.shape[1]):
-            value = x[row, column] + bias[column]
-            x[row, column] = zero if rectify and value <= zero else value
-
-
-@inlined
-def _goals(rows: _Rows, start: int, online: _Layers, target: _Layers, room: _Room, double: bool) -> None:
+def _goals(rows: _Rows, start: int, online: Layers, target: Layers, room: _Room, double: bool) -> None:
     """Writes what the taken actions' values should be (see `double_q_target`, `q_target`)."""
     _values(rows.s_t, start, target, room.other)
     q_t = room.other[-1]
@@ -225,10 +193,7 @@ def _goals(rows: _Rows, start: int, online: _Layers, target: _Layers, room: _Roo
         _values(rows.s_t, start, online, room.seen)
         chooser = room.seen[-1]
     for row in range(len(room.goal)):
-        best = 0
-        for action in range(1, q_t.shape[1]):
-            if chooser[row, action] > chooser[row, best]:
-                best = action
+        best = best_of(chooser, row)
         room.goal[row] = rows.r_t[start + row] + rows.discount_t[start + row] * q_t[row, best]
 
 
@@ -259,21 +224,21 @@ def _losses(rows: _Rows, start: int, room: _Room, huber: bool, errors: Floats, s
 
 
 @inlined
-def _gradients(actions: NDArray[np.int64], start: int, online: _Layers, slopes: _Layers, room: _Room) -> None:
+def _gradients(actions: NDArray[np.int64], start: int, online: Layers, slopes: Layers, room: _Room) -> None:
     """Back-propagates `room.slope`; the loss's derivatives by the hidden layers go to `room.other`."""
     last = len(online.weights) - 1
     _head_gradients(actions, start, online, slopes, room)
     for i in range(last - 1, -1, -1):
         delta, inputs = room.other[i + 1], room.seen[i]
         _add_up(delta, slopes.biases[i])
-        _multiply(delta.T, inputs, slopes.weights[i])
+        multiply(delta.T, inputs, slopes.weights[i])
         if i > 0:
-            _multiply(delta, online.weights[i], room.other[i])
+            multiply(delta, online.weights[i], room.other[i])
             _stop_where_idle(room.other[i], inputs)
 
 
 @inlined
-def _head_gradients(actions: NDArray[np.int64], start: int, online: _Layers, slopes: _Layers, room: _Room) -> None:
+def _head_gradients(actions: NDArray[np.int64], start: int, online: Layers, slopes: Layers, room: _Room) -> None:
     """The last layer's gradients, and the derivatives by its inputs."""
     last = len(online.weights) - 1
     weight, weight_slope, bias_slope = online.weights[last], slopes.weights[last], slopes.biases[last]
@@ -310,7 +275,7 @@ def _add_up(delta: Floats, total: Floats) -> None:
 def _adam(flat: _Flat, rule: _Rule, learning_rate: float, steps: float) -> None:
     """Scales the gradients down to `max_norm`, as PyTorch does, and makes Adam's step of them."""
     one = np.float32(1)
-    norm = np.sqrt(_square(flat.slopes))
+    norm = np.sqrt(square(flat.slopes))
     scale = np.float32(rule.max_norm) / (norm + np.float32(1e-6))
     scale = one if scale > one else scale
     share_mean, share_square = np.float32(1 - rule.beta_mean), np.float32(1 - rule.beta_square)

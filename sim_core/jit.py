@@ -1,8 +1,8 @@
 """Compiler options of every kernel, in one place.
 
 Numba caches compiled kernels on disk, but it notices changes of a kernel's own file only: one that takes in kernels
-of other files would go on with their old code. The cache therefore lies in a folder that is named
-after the content of all sources of this package; changed sources start an empty one.
+of other files would go on with their old code. The cache therefore lies in a folder that is named after the content of
+all sources of this package, and of those of its neighbours that have kernels; changed sources start an empty one.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from numba import njit
 
 JIT_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": True, "_nrt": False}
 """Cached on disk, IEEE division, no fastmath, and without numba's run-time, so that a kernel cannot allocate."""
+NEIGHBOURS = ("actors", "learner")
+"""Packages beside this one that have kernels, too."""
 
 
 def _cache_folder() -> str:
@@ -26,8 +28,11 @@ def _cache_folder() -> str:
     """
     package = Path(__file__).parent
     digest = hashlib.sha256()
-    for source in sorted(package.rglob("*.py")):
-        digest.update(str(source.relative_to(package)).encode() + b"\0" + source.read_bytes())
+    for folder in (package, *(package.parent / name for name in NEIGHBOURS)):
+        for source in sorted(folder.rglob("*.py")):
+            content = source.read_bytes()
+            if folder == package or b"sim_core.jit" in content:
+                digest.update(str(source.relative_to(package.parent)).encode() + b"\0" + content)
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "shoal"
     beside = package / "__pycache__" if os.access(package, os.W_OK) else user
     base = Path(numba.config.CACHE_DIR) if numba.config.CACHE_DIR else beside
