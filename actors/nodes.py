@@ -24,7 +24,18 @@ from actors.parts import PartWriter, Written
 from actors.prioritised import PrioritisedShard, PrioritySettings
 from actors.replay import ReplayShard
 from actors.rollout import RolloutSettings, RolloutWorker
-from actors.transitions import AddReply, BlockReport, Delivered, Dropped, SampleReply, TransitionBlock
+from actors.stopwatch import Stopwatch
+from actors.transitions import (
+    ACTS,
+    STORES,
+    WAITS,
+    AddReply,
+    BlockReport,
+    Delivered,
+    Dropped,
+    SampleReply,
+    TransitionBlock,
+)
 
 REMEMBERED_BLOCKS = 8
 """Blocks of a worker that a shard knows one by one; more than may be under way at once."""
@@ -190,6 +201,7 @@ class RolloutNode:
         self._limit = pushes_in_flight
         self._writer = PartWriter()
         self._pushes: deque[_Push] = deque()
+        self._watch = Stopwatch()
 
     def replace_shard(self, index: int, shard: Node, incarnation: int) -> None:
         """Pushes to `shard` from now on where it pushed to the shard of this index."""
@@ -210,11 +222,17 @@ class RolloutNode:
         """
         if self._worker.policy_version < 0:
             raise CallFailed(Fault.OBJECT_LOST, "it has no weights")
+        self._watch.lap(WAITS)
         block = self._worker.collect(rate)
+        self._watch.lap(ACTS)
         shard = self._next_shard
         self._next_shard = (self._next_shard + 1) % len(self._shards)
         self._pushes.append(self._push(block, shard, 1))
-        return self._confirm(self._limit)
+        reports = self._confirm(self._limit)
+        self._watch.lap(STORES)
+        if reports:
+            reports[-1] = reports[-1]._replace(seconds=self._watch.take())
+        return reports
 
     def _push(self, block: TransitionBlock, shard: int, attempt: int) -> _Push:
         ref = self._calls.start(self._shards[shard], "add", block)

@@ -80,11 +80,16 @@ class Dropped(StrEnum):
     """Its worker went before it was pushed."""
 
 
+ACTS, STORES, WAITS = "acts", "stores", "waits"
+"""A rollout worker steps its environments, waits for a shard's reply to a push, waits for the training loop."""
+
+
 class BlockReport(NamedTuple):
     """What the training loop learns of a block; no transitions.
 
     `shard` and its incarnation say where it was pushed, `rows` how many transitions it holds; with a reason in
-    `dropped` none of them is stored, because of `fault` if the shard failed.
+    `dropped` none of them is stored, because of `fault` if the shard failed. `seconds` says where the worker's time
+    went since its last report (see ACTS, STORES, WAITS).
     """
 
     header: BlockHeader
@@ -97,6 +102,7 @@ class BlockReport(NamedTuple):
     shard_incarnation: int = 0
     dropped: Dropped | None = None
     fault: Fault | None = None
+    seconds: dict[str, float] = {}  # never changed
 
 
 class Delivered(NamedTuple):

@@ -11,6 +11,12 @@ from actors.transitions import NO_OUTCOME, BlockReport
 from learner.node import UpdateReport
 from sim_core.outcomes import Outcome
 
+HOPS = {
+    "worker": ("worker_acts", "worker_stores", "worker_waits"),
+    "learner": ("learner_updates", "learner_samples", "learner_publishes", "learner_waits"),
+}
+"""What a part's time goes to; the shares of all rollout workers together, and of the learner, sum to 1."""
+
 
 class Meters:
     """Collects what happened since the last row."""
@@ -42,12 +48,18 @@ class Meters:
             successes=float((episodes.outcome == Outcome.GOAL).sum()),
         )
         self._measured["env_steps"] += report.header.env_steps
+        self._take_seconds("worker", report.seconds)
 
     def take_updates(self, report: UpdateReport, updates: int) -> None:
         """Counts a call of updates."""
         stats = report.stats
         self._add(calls=1, loss=stats.loss, q_mean=stats.q_mean, td_error=stats.td_error)
         self._measured["updates"] += updates
+        self._take_seconds("learner", report.seconds)
+
+    def _take_seconds(self, part: str, seconds: dict[str, float]) -> None:
+        self._add(**{f"{part}_{what}": value for what, value in seconds.items()})
+        self._add(**{f"{part}_seconds": sum(seconds.values())})
 
     def row(self, replay_size: int, samples_per_insert: float) -> dict[str, float]:
         """The metrics since the last row; starts the next."""
@@ -58,13 +70,15 @@ class Meters:
         metrics |= self._means("train/", "calls", {"loss": "loss", "q_mean": "q_mean", "td_error": "td_error"})
         staleness = {"staleness_updates": "staleness_updates", "staleness_s": "staleness_s"}
         metrics |= self._means("policy/", "blocks", staleness)
+        for part, hops in HOPS.items():
+            metrics |= self._means("time/", f"{part}_seconds", {hop: hop for hop in hops})
         metrics |= self._speeds()
         self._sums = {}
         return metrics
 
     def _means(self, prefix: str, count: str, names: dict[str, str]) -> dict[str, float]:
         total = self._sums.get(count, 0.0)
-        return {prefix + key: self._sums[name] / total for key, name in names.items()} if total else {}
+        return {prefix + key: self._sums.get(name, 0.0) / total for key, name in names.items()} if total else {}
 
     def _speeds(self) -> dict[str, float]:
         now_s = time.perf_counter()

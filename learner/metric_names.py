@@ -127,6 +127,23 @@ REPLAY = (
     ),
 )
 
+
+def _share(part: str, does: str, meaning: str, healthy: str) -> Exported:
+    text = f"of the {part}'s time: {meaning}"
+    return _gauge(f"time/{part.split()[-1]}_{does}", f"time_{part.split()[-1]}_{does}", "share", text, healthy)
+
+
+_LIMITS = "high where it limits the run"
+TIMES = (
+    _share("rollout worker", "acts", "stepping environments", _LIMITS),
+    _share("rollout worker", "stores", "waiting for a shard's reply to a push", "small"),
+    _share("rollout worker", "waits", "waiting for the training loop", "high where the learner limits the run"),
+    _share("learner", "updates", "making updates", _LIMITS),
+    _share("learner", "samples", "drawing transitions, or waiting for shards", "small"),
+    _share("learner", "publishes", "handing out weights and TD errors", "small"),
+    _share("learner", "waits", "waiting for the training loop", "high where the rollout workers limit the run"),
+)
+
 # Ray shows a counter once it counts: what should stay 0 is a gauge.
 ACCOUNTS = (
     _counter("account/produced", "transitions_produced", "transitions", "made by rollout workers", "stored + dropped"),
@@ -142,5 +159,5 @@ HEALTH = (
     ),
 )
 
-METRICS: tuple[Exported, ...] = (*THROUGHPUT, *LEARNING, *EVALUATION, *REPLAY, *ACCOUNTS, *HEALTH)
+METRICS: tuple[Exported, ...] = (*THROUGHPUT, *LEARNING, *EVALUATION, *REPLAY, *TIMES, *ACCOUNTS, *HEALTH)
 """All of them, in the order of the operator's page."""

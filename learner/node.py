@@ -16,22 +16,29 @@ from actors.faults import CallFailed, Part, PartFailed, PartKind
 from actors.locations import Location, fetched, inside
 from actors.nodes import ShardNode
 from actors.parts import PartWriter, Written, join_written
-from actors.transitions import AddReply, Delivered, Draws, SampleReply, TransitionBlock
+from actors.stopwatch import Stopwatch
+from actors.transitions import WAITS, AddReply, Delivered, Draws, SampleReply, TransitionBlock
 from learner.double_dqn import importance_weights
 from learner.learner import Learner
 from learner.updates import LearnerSettings, UpdateStats
 
 SLOW_CALL_S = 3_600.0
+SAMPLES, UPDATES, PUBLISHES = "samples", "updates", "publishes"
+"""The learner waits for its shards' rows, makes updates of them, hands out TD errors and weights."""
 WEIGHTS = "learner.safetensors"
 """File of networks and optimiser in a checkpoint."""
 
 
 class UpdateReport(NamedTuple):
-    """What a call of updates gives back: their means, the version reached, and a reference to the weights."""
+    """What a call of updates gives back: their means, the version reached, and a reference to the weights.
+
+    `seconds` says where the learner's time went since its last report (see SAMPLES, UPDATES, PUBLISHES, WAITS).
+    """
 
     stats: UpdateStats
     version: int
     weights: list[Ref]
+    seconds: dict[str, float]
 
 
 class Sample(NamedTuple):
@@ -69,6 +76,7 @@ class LearnerNode:
         self._answers: dict[int, Ref] = {}
         self._weights: Ref = None
         self._writer = PartWriter()
+        self._watch = Stopwatch()
         self.publish()
 
     def add(self, block: TransitionBlock) -> AddReply:
@@ -111,14 +119,18 @@ class LearnerNode:
 
         Of prioritised shards the sample is weighted, and the TD errors go back to the shards that it came from.
         """
-        sample = self._sample(updates * self._settings.batch_size)
-        if sample.draws is None:
-            stats = self._learner.update(sample.rows, learning_rate)
-        else:
+        self._watch.lap(WAITS)
+        sample, weights = self._sample(updates * self._settings.batch_size), None
+        self._watch.lap(SAMPLES)
+        if sample.draws is not None:
             weights = importance_weights(sample.draws.probability, self._settings.batch_size, importance_exponent)
-            stats = self._learner.update(sample.rows, learning_rate, weights)
+        stats = self._learner.update(sample.rows, learning_rate, weights)
+        self._watch.lap(UPDATES)
+        if sample.draws is not None:
             self._answer(sample)
-        return UpdateReport(stats, self._learner.updates, self.publish())
+        published = self.publish()
+        self._watch.lap(PUBLISHES)
+        return UpdateReport(stats, self._learner.updates, published, self._watch.take())
 
     def publish(self) -> list[Ref]:
         """Shares the newest weights with all shards, whose replies carry them to the workers.

@@ -19,7 +19,7 @@ from tests.checkpointing import Silent
 from tests.integration.conftest import flags
 from tests.integration.jobs import Job
 
-CLOCKED = ("speed/", "system/", "policy/staleness_s")
+CLOCKED = ("speed/", "system/", "time/", "policy/staleness_s")
 """Metrics that depend on the clock."""
 
 

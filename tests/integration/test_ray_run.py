@@ -58,7 +58,14 @@ def test_a_run_over_ray_leaves_everything_a_user_compares(shoal, tmp_path):
     assert tags == {"method": "sensor", "robots": "3", "groups": "2", "seed": "0", "engine": "ray"}
     assert len(run.data.tags["mlflow.source.git.commit"]) in (40, len("unknown"))
     assert len(run.data.metrics) < 30
-    for key in ("final/success_rate_low", "train/q_mean", "train/td_error", "policy/staleness_updates", "eval/return"):
+    for key in (
+        "final/success_rate_low",
+        "train/q_mean",
+        "time/learner_waits",
+        "time/worker_waits",
+        "policy/staleness_updates",
+        "eval/return",
+    ):
         assert key in run.data.metrics
     artifacts = {item.path for item in client.list_artifacts(run.info.run_id)}
     assert artifacts == {"config.json", "learning_curve.png", "episode.html", "episode.zarr"}

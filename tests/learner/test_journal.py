@@ -116,5 +116,7 @@ def test_rows_are_read_while_they_are_written(tmp_path):
 
 def test_mlflow_gets_no_accounts_and_no_interval_but_the_results():
     kept = {"final/success_rate": 0.5, "final/success_rate_low": 0.4, "final/return_high": 2.0, "eval/lost_rate": 0.1}
+    kept |= {"time/worker_waits": 0.1, "time/learner_samples": 0.2}
     names = "account/produced replay/size policy/staleness_s eval/success_rate_low eval/return_high final/lost_rate_low"
+    names += " time/worker_acts train/td_error"
     assert charted(kept | dict.fromkeys(names.split(), 1.0)) == kept

@@ -30,8 +30,8 @@ def filled():
     meters = Meters()
     meters.take_block(report([1, 2, 1], [4.0, -1.0, 3.0], [10, 20, 60], staleness_updates=3, staleness_s=0.5, rate=0.8))
     meters.take_block(report([5], [-2.0], [30], staleness_updates=1, staleness_s=1.5, rate=0.7))
-    meters.take_updates(UpdateReport(UpdateStats(1.0, 2.0, 3.0), 8, []), 8)
-    meters.take_updates(UpdateReport(UpdateStats(2.0, 4.0, 6.0), 16, []), 8)
+    meters.take_updates(UpdateReport(UpdateStats(1.0, 2.0, 3.0), 8, [], {"updates": 3.0, "waits": 0.5}), 8)
+    meters.take_updates(UpdateReport(UpdateStats(2.0, 4.0, 6.0), 16, [], {"updates": 4.0, "samples": 0.5}), 8)
     return meters
 
 
@@ -49,6 +49,10 @@ def test_a_row_holds_means_over_episodes_blocks_and_calls():
         "policy/staleness_s": 1.0,
         "replay/size": 1234.0,
         "replay/samples_per_insert": 3.5,
+        "time/learner_updates": 7 / 8,
+        "time/learner_samples": 0.5 / 8,
+        "time/learner_publishes": 0.0,
+        "time/learner_waits": 0.5 / 8,
     }
     assert expected.items() <= row.items()
     rest = {name for name in row if name not in expected}
@@ -57,6 +61,19 @@ def test_a_row_holds_means_over_episodes_blocks_and_calls():
         "speed/updates_per_s",
         "system/cpu_utilization_percentage",
         "system/system_memory_usage_percentage",
+    }
+
+
+def test_shares_of_time_are_those_of_all_workers_together():
+    meters = Meters()
+    meters.take_block(report([], [], [])._replace(seconds={"acts": 3.0, "waits": 1.0}))
+    meters.take_block(report([], [], [])._replace(seconds={"acts": 1.0, "stores": 3.0}))
+    meters.take_block(report([], [], []))  # of a block that was reported with another
+    row = meters.row(0, 0.0)
+    assert {name: share for name, share in row.items() if name.startswith("time/")} == {
+        "time/worker_acts": 0.5,
+        "time/worker_stores": 0.375,
+        "time/worker_waits": 0.125,
     }
 
 
