@@ -20,8 +20,8 @@ from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 from scipy import stats  # noqa: E402
 
-from deploy.chaos_processes import TITLES  # noqa: E402
 from deploy.cli import main as shoal  # noqa: E402
+from tests.benchmarks.processes import kind_of  # noqa: E402
 
 FOREVER = 10**12
 """Env steps that no soak comes to."""
@@ -45,17 +45,6 @@ class Usage(NamedTuple):
     megabytes: float
     handles: int
     threads: int
-
-
-def kind_of(process: psutil.Process) -> str:
-    """What a process of the run's does."""
-    words = process.cmdline() or [process.name()]
-    for kind, title in TITLES.items():
-        if words[0].startswith(title):
-            return kind
-    if words[0].startswith("ray::IDLE"):
-        return "idle worker of Ray"
-    return next((name for name in ("raylet", "gcs_server") if name in words[0]), "other process of Ray")
 
 
 def usage(time_s: float) -> list[Usage]:

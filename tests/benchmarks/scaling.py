@@ -1,0 +1,310 @@
+"""How the service scales: what each hop costs, what a model makes of that, and what the service really does."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+import psutil
+import ray
+from rich.console import Console
+from rich.table import Table
+
+from actors.network import WeightsSnapshot
+from actors.nodes import make_shard
+from actors.rollout import RolloutWorker
+from actors.transitions import TransitionBlock, transition_dtype
+from actors.vector_env import env_shape
+from learner.cluster import learner_settings, rollout_settings, shard_settings
+from learner.config import RunConfig
+from learner.learner import Learner
+from learner.ray_edge import connect
+from tests.benchmarks.processes import cpu_seconds
+from tests.benchmarks.ray_service import ray_service
+from tests.benchmarks.service import learner_work, worker_work
+from tests.benchmarks.service_model import (
+    LEARNER,
+    SHARDS,
+    WORKERS,
+    Costs,
+    Work,
+    bounds,
+    messages,
+    network_bytes,
+    saturation,
+    seconds_per_env_step,
+)
+from tests.benchmarks.timing import spread, stopwatch, timed_rates
+from tests.checkpointing import Silent
+
+POINTS = ((1, 2.0), (2, 2.0), (4, 2.0), (8, 2.0), (1, 0.25), (2, 0.25), (1, 8.0), (2, 8.0))
+"""Rollout workers and samples per insert that are measured."""
+ROUNDS = 5
+CALLS = 200
+WARM_S, COUNTED_S = 3.0, 10.0
+PICTURE = Path(__file__).parents[2] / "dashboards" / "images" / "service-model.png"
+
+
+class Hop:
+    """The far side of every kind of call, as a Ray actor."""
+
+    def __init__(self, config: RunConfig, block: TransitionBlock) -> None:
+        self._shard = make_shard(shard_settings(config, env_shape(config.env))[0])
+        self._sequence = 0
+        while self._shard.size < config.replay_capacity:
+            self.store(block)
+
+    def cpu_s(self) -> float:
+        """CPU time of this process so far, Ray's threads included."""
+        return time.process_time()
+
+    def nothing(self) -> None:
+        """An order that is done at once."""
+
+    def store(self, block: TransitionBlock) -> None:
+        """Stores a block as if it were new."""
+        self._sequence += 1
+        header = block.header._replace(sequence=self._sequence)
+        self._shard.add(block._replace(header=header))
+
+    def give(self, count: int) -> np.ndarray:
+        """Rows that are drawn here."""
+        return self._shard.sample(count).rows
+
+    def fetch(self, weights: list[Any]) -> int:
+        """Takes what was published."""
+        snapshot: WeightsSnapshot = ray.get(weights[0])
+        return snapshot.version
+
+
+def cpu_of_calls(hop: Any, call: Callable[[], Any], count: int = CALLS) -> tuple[float, float]:
+    """CPU seconds that one of `count` calls costs (here, there)."""
+    call()
+    there, here = ray.get(hop.cpu_s.remote()), time.process_time()
+    for _ in range(count):
+        call()
+    here = time.process_time() - here
+    return here / count, (ray.get(hop.cpu_s.remote()) - there) / count
+
+
+def measured_costs(config: RunConfig, work: Work) -> Costs:
+    """Costs of all hops, each by itself."""
+    bare = {"worker": worker_work(config), "learner": learner_work(config)}
+    found = timed_rates({name: stopwatch(one, time.process_time) for name, one in bare.items()}, ROUNDS)
+    shape, rows = env_shape(config.env), config.batch_size * config.updates_per_call
+    learner, worker = Learner(learner_settings(config, shape)), RolloutWorker(rollout_settings(config), 0, 0)
+    worker.set_weights(learner.weights(0.0))
+    block = worker.collect(0.1)
+    connect(2, None)
+    try:
+        hop = ray.remote(num_cpus=1)(Hop).remote(config, block)
+        ask, do = cpu_of_calls(hop, lambda: ray.get(hop.nothing.remote()))
+        push, store = cpu_of_calls(hop, lambda: ray.get(hop.store.remote(block)))
+        take, give = cpu_of_calls(hop, lambda: ray.get(hop.give.remote(rows)))
+        publish, _ = cpu_of_calls(hop, lambda: ray.put(learner.weights(0.0)))
+        fetch = cpu_of_calls(hop, lambda: ray.get(hop.fetch.remote([ray.put(learner.weights(0.0))])))[1] - do
+    finally:
+        ray.shutdown()
+    return Costs(
+        env_step=1 / spread(found["worker"]).median,
+        update=1 / spread(found["learner"]).median,
+        draw=cpu_of_a_draw(config, block, rows),
+        ask=ask,
+        do=do,
+        push=push,
+        store=store,
+        give=max(0.0, give - do) / rows,
+        take=max(0.0, take - ask) / rows,
+        publish=publish,
+        fetch=max(0.0, fetch),
+    )
+
+
+def cpu_of_a_draw(config: RunConfig, block: TransitionBlock, count: int) -> float:
+    """CPU seconds of a row that is drawn in its own process."""
+    hop = Hop(config, block)
+
+    def draw() -> int:
+        hop.give(count)
+        return count
+
+    return 1 / spread(timed_rates({"draw": stopwatch(draw, time.process_time)}, 20)["draw"]).median
+
+
+class Point(NamedTuple):
+    """What the service did: rates, CPU seconds per env step by process, and shares of waiting."""
+
+    env_steps_per_s: float
+    updates_per_s: float
+    cpu_s: dict[str, float]
+    waits: dict[str, float]
+
+
+class LastRow(Silent):
+    """Keeps the newest row of metrics."""
+
+    def __init__(self) -> None:
+        self.metrics: dict[str, float] = {}
+
+    def row(self, row):
+        self.metrics |= row.metrics
+
+
+def measured_point(config: RunConfig) -> Point:
+    """The service over Ray in its steady state."""
+    marks: list[tuple[float, int, int, dict[str, float]]] = []
+    observer = LastRow()
+    with ray_service(config) as make_loop:
+        begun_s: list[float] = []
+
+        def mark() -> None:
+            marks.append((time.perf_counter(), loop.env_steps, loop.updates, cpu_seconds()))
+
+        def stop() -> bool:
+            now_s = time.perf_counter()
+            if not begun_s and loop.updates:
+                begun_s.append(now_s)
+            elif begun_s and not marks and now_s - begun_s[0] > WARM_S:
+                mark()
+            elif marks and now_s - marks[0][0] > COUNTED_S:
+                mark()
+                return True
+            return False
+
+        loop = make_loop(observer, stop)
+        loop.run()
+    (start_s, first, first_updates, before), (end_s, last, updates, after) = marks
+    spent = {kind: (after[kind] - before.get(kind, 0.0)) / (last - first) for kind in after}
+    waits = {name: observer.metrics[f"time/{name}"] for name in ("worker_stores", "worker_waits", "learner_waits")}
+    return Point((last - first) / (end_s - start_s), (updates - first_updates) / (end_s - start_s), spent, waits)
+
+
+def microseconds(value: float) -> str:
+    return f"{1e6 * value:,.2f}"
+
+
+def cost_table(costs: Costs, work: Work) -> Table:
+    table = Table(title="what each hop costs, CPU microseconds")
+    table.add_column("cost")
+    table.add_column("each", justify="right")
+    table.add_column("of")
+    what = {
+        "env_step": "an env step of a rollout worker",
+        "update": f"an update of batch {work.batch_size}",
+        "draw": "a row drawn in the learner's process",
+        "ask": "a call, who asks",
+        "do": "a call, who answers",
+        "push": f"a block of {work.block_env_steps:,} transitions, who pushes",
+        "store": "the same, who stores",
+        "give": "a row drawn in another process, there",
+        "take": "the same, at the learner",
+        "publish": "weights, who publishes",
+        "fetch": "weights, who fetches",
+    }
+    for name, text in what.items():
+        table.add_row(name, microseconds(getattr(costs, name)), text)
+    return table
+
+
+def point_table(points: dict[tuple[int, float], Point], costs: Costs, work: Work, cores: int) -> Table:
+    table = Table(title=f"the service on {cores} cores, measured and predicted")
+    columns = ("workers", "samples/insert", "env steps/s", "updates/s", "predicted", "bound by", "measured / predicted")
+    for column in (*columns, "CPU µs/env step: workers", "learner", "driver", "Ray", "waiting: workers", "learner"):
+        table.add_column(column, justify="right")
+    for (workers, samples), point in points.items():
+        bound = bounds(costs, work._replace(samples_per_insert=samples), workers, cores=cores)[0]
+        known = [point.cpu_s.get(kind, 0.0) for kind in ("rollout worker", "learner", "driver")]
+        rest = sum(point.cpu_s.values()) - sum(known)
+        table.add_row(
+            str(workers),
+            f"{samples:g}",
+            f"{point.env_steps_per_s:,.0f}",
+            f"{point.updates_per_s:,.0f}",
+            f"{bound.env_steps_per_s:,.0f}",
+            bound.hop,
+            f"{point.env_steps_per_s / bound.env_steps_per_s:.2f}",
+            *map(microseconds, [*known, rest]),
+            f"{point.waits['worker_stores'] + point.waits['worker_waits']:.0%}",
+            f"{point.waits['learner_waits']:.0%}",
+        )
+    return table
+
+
+def saturation_table(costs: Costs, work: Work) -> Table:
+    table = Table(title="with a core for every process: where each hop is full, by the model")
+    for column in ("samples/insert", "shards", "full first", "at env steps/s", "rollout workers", "messages/s", "MB/s"):
+        table.add_column(column, justify="right")
+    for samples in sorted({samples for _, samples in POINTS}):
+        here = work._replace(samples_per_insert=samples)
+        for own in (False, True):
+            seconds = seconds_per_env_step(costs, here, own)
+            others = {hop: spent for hop, spent in seconds.items() if hop not in (WORKERS, SHARDS)}
+            full = max(others, key=lambda hop: others[hop])
+            rate = 1 / others[full]
+            shards = max(1, int(np.ceil(seconds[SHARDS] * rate))) if own else 0
+            table.add_row(
+                f"{samples:g}",
+                f"{shards} of their own" if own else "with the learner",
+                full,
+                f"{rate:,.0f}",
+                f"{saturation(costs, here, own)[full]:.1f}",
+                f"{messages(here, shards) * rate:,.0f}",
+                f"{network_bytes(here, own) * rate / 1e6:,.0f}",
+            )
+    return table
+
+
+def draw(points: dict[tuple[int, float], Point], costs: Costs, work: Work, cores: int) -> None:
+    """The picture: predictions as lines, what was measured as points."""
+    figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
+    counts = np.geomspace(1, 64, 49)
+    for i, samples in enumerate(sorted({samples for _, samples in points})):
+        here = work._replace(samples_per_insert=samples)
+        for limit, style, where in ((np.inf, "--", "a core for every process"), (cores, "-", f"{cores} cores")):
+            rates = [bounds(costs, here, count, cores=limit)[0].env_steps_per_s for count in counts]
+            label = f"model, {samples:g} samples per insert, {where}"
+            axes.plot(counts, rates, style, color=f"C{i}", label=label)
+        mine = {workers: point.env_steps_per_s for (workers, of), point in points.items() if of == samples}
+        axes.plot(list(mine), list(mine.values()), "o", color=f"C{i}", label=f"measured, {cores} cores")
+    axes.set(xscale="log", yscale="log", xlabel="rollout workers", ylabel="env steps/s")
+    axes.set_xticks([1, 2, 4, 8, 16, 32, 64], ["1", "2", "4", "8", "16", "32", "64"])
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.savefig(PICTURE, dpi=120)
+    plt.close(figure)
+
+
+def work_of(config: RunConfig) -> Work:
+    shape = env_shape(config.env)
+    arrays = Learner(learner_settings(config, shape)).weights(0.0).arrays
+    row = transition_dtype(shape.observation_space).itemsize
+    weights = sum(array.nbytes for array in arrays)
+    sizes = (config.batch_size, config.updates_per_call)
+    return Work(config.block_env_steps, config.samples_per_insert, *sizes, row, weights)
+
+
+def main() -> None:
+    never = {"total_env_steps": 10**9, "eval_every_env_steps": 10**9, "checkpoint_every_env_steps": 10**9}
+    config = RunConfig(**never)
+    work, cores = work_of(config), psutil.cpu_count() or 1
+    costs = measured_costs(config, work)
+    points = {}
+    for workers, samples in POINTS:
+        points[workers, samples] = measured_point(
+            dataclasses.replace(config, workers=workers, samples_per_insert=samples)
+        )
+    console = Console(width=200)
+    for table in (cost_table(costs, work), point_table(points, costs, work, cores), saturation_table(costs, work)):
+        console.print(table)
+    learner = seconds_per_env_step(costs, work, False)[LEARNER]
+    console.print(
+        f"{work.row_bytes} bytes a transition, {work.weights_bytes:,} a copy of the weights; the learner's "
+        f"{microseconds(learner)} µs per env step are {work.samples_per_insert:g} samples",
+        highlight=False,
+    )
+    draw(points, costs, work, cores)
+    console.print(f"drawn: {PICTURE}", highlight=False)

@@ -1,0 +1,96 @@
+"""What the parts of the service cost predicts how fast it runs: a model of its hops, in CPU seconds.
+
+Every hop has one process that serves it (or several: the rollout workers, the shards), so that it can do no more
+env steps a second than 1 / (its CPU seconds per env step) times the number of its processes; and all processes together
+can spend no more than the machine's cores. The smallest of these bounds is the prediction.
+"""
+
+import math
+from typing import NamedTuple
+
+
+class Costs(NamedTuple):
+    """CPU seconds, each measured by itself.
+
+    `env_step` of a rollout worker and `update` of the learner are those of the bare parts; the learner's `draw` is
+    of one row from a shard in its own process. A call costs who asks `ask` and who does it `do`. A block costs who
+    pushes it `push` and who stores it `store`; a row that another process drew costs `give` there and `take` here.
+    Weights cost the learner `publish`, and whoever fetches them `fetch`.
+    """
+
+    env_step: float
+    update: float
+    draw: float
+    ask: float
+    do: float
+    push: float
+    store: float
+    give: float
+    take: float
+    publish: float
+    fetch: float
+
+
+class Work(NamedTuple):
+    """Sizes that a run's config sets, and the bytes of one packed transition and of the weights."""
+
+    block_env_steps: int
+    samples_per_insert: float
+    batch_size: int
+    updates_per_call: int
+    row_bytes: int
+    weights_bytes: int
+
+    @property
+    def calls_per_env_step(self) -> float:
+        """Calls of updates per env step."""
+        return self.samples_per_insert / (self.batch_size * self.updates_per_call)
+
+
+class Bound(NamedTuple):
+    """Env steps a second that a hop allows."""
+
+    hop: str
+    env_steps_per_s: float
+
+
+WORKERS, LEARNER, SHARDS, DRIVER, CORES = "rollout workers", "learner", "replay shards", "driver", "cores"
+
+
+def seconds_per_env_step(costs: Costs, work: Work, own_shards: bool) -> dict[str, float]:
+    """CPU seconds per env step of each hop, all its processes together; shards are hops where they have their own."""
+    rows, blocks, calls = work.samples_per_insert, 1 / work.block_env_steps, work.calls_per_env_step
+    worker = costs.env_step + blocks * (costs.do + costs.push + costs.fetch)  # new weights with each block's reply
+    learner = rows / work.batch_size * costs.update + calls * (costs.do + costs.publish)
+    driver = (blocks + calls) * costs.ask
+    if own_shards:
+        shards = {SHARDS: blocks * costs.store + rows * costs.give + calls * costs.do}
+        return {WORKERS: worker, LEARNER: learner + calls * costs.ask + rows * costs.take, **shards, DRIVER: driver}
+    return {WORKERS: worker, LEARNER: learner + blocks * costs.store + rows * costs.draw, DRIVER: driver}
+
+
+def bounds(costs: Costs, work: Work, workers: int, shards: int = 0, cores: float = math.inf) -> list[Bound]:
+    """What each hop allows, the tightest first; `shards` is 0 where they live in the learner's process."""
+    seconds = seconds_per_env_step(costs, work, shards > 0)
+    processes = {WORKERS: workers, SHARDS: shards}
+    found = [Bound(hop, processes.get(hop, 1) / spent) for hop, spent in seconds.items()]
+    found.append(Bound(CORES, cores / sum(seconds.values())))
+    return sorted(found, key=lambda bound: bound.env_steps_per_s)
+
+
+def saturation(costs: Costs, work: Work, own_shards: bool) -> dict[str, float]:
+    """How many rollout workers each other hop takes up: a shard one's share, whose number is as free as theirs."""
+    seconds = seconds_per_env_step(costs, work, own_shards)
+    return {hop: seconds[WORKERS] / spent for hop, spent in seconds.items() if hop != WORKERS}
+
+
+def network_bytes(work: Work, own_shards: bool) -> float:
+    """Bytes between processes per env step: blocks, samples where shards have processes of their own, weights."""
+    samples = work.samples_per_insert if own_shards else 0.0
+    return (1 + samples) * work.row_bytes + work.weights_bytes / work.block_env_steps
+
+
+def messages(work: Work, shards: int) -> float:
+    """Calls between processes per env step, replies not counted: orders, pushes, samples, publications."""
+    per_call = 1 + 2 * shards  # the order to update; a sample from, and the news of weights to, every shard
+    return 2 / work.block_env_steps + work.calls_per_env_step * per_call
