@@ -31,6 +31,10 @@ def test_a_count_that_goes_up_and_down_is_flat_however_its_quarters_compare():
     assert is_flat(series("objects in the store", processes=lambda i: int(looks[i])))
 
 
+def test_a_pool_of_threads_that_was_larger_for_a_while_is_flat():
+    assert is_flat(series("gcs_server", threads=lambda i: 29 + 2 * (i > 3.4 * QUARTER)))
+
+
 @pytest.mark.parametrize(
     "leak",
     [
