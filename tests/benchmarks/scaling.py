@@ -2,29 +2,23 @@
 
 import dataclasses
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 import psutil
-import ray
 from rich.console import Console
 from rich.table import Table
 
-from actors.network import WeightsSnapshot
-from actors.nodes import make_shard
-from actors.rollout import RolloutWorker
-from actors.transitions import TransitionBlock, transition_dtype
+from actors.transitions import transition_dtype
 from actors.vector_env import env_shape
-from learner.cluster import learner_settings, rollout_settings, shard_settings
+from learner.cluster import learner_settings
 from learner.config import RunConfig
 from learner.learner import Learner
-from learner.ray_edge import connect
+from tests.benchmarks.hop_costs import measured_costs
 from tests.benchmarks.processes import cpu_seconds
 from tests.benchmarks.ray_service import ray_service
-from tests.benchmarks.service import learner_work, worker_work
 from tests.benchmarks.service_model import (
     LEARNER,
     SHARDS,
@@ -37,101 +31,12 @@ from tests.benchmarks.service_model import (
     saturation,
     seconds_per_env_step,
 )
-from tests.benchmarks.timing import spread, stopwatch, timed_rates
 from tests.checkpointing import Silent
 
 POINTS = ((1, 2.0), (2, 2.0), (4, 2.0), (8, 2.0), (1, 0.25), (2, 0.25), (1, 8.0), (2, 8.0))
 """Rollout workers and samples per insert that are measured."""
-ROUNDS = 5
-CALLS = 200
 WARM_S, COUNTED_S = 3.0, 10.0
 PICTURE = Path(__file__).parents[2] / "dashboards" / "images" / "service-model.png"
-
-
-class Hop:
-    """The far side of every kind of call, as a Ray actor."""
-
-    def __init__(self, config: RunConfig, block: TransitionBlock) -> None:
-        self._shard = make_shard(shard_settings(config, env_shape(config.env))[0])
-        self._sequence = 0
-        while self._shard.size < config.replay_capacity:
-            self.store(block)
-
-    def cpu_s(self) -> float:
-        """CPU time of this process so far, Ray's threads included."""
-        return time.process_time()
-
-    def nothing(self) -> None:
-        """An order that is done at once."""
-
-    def store(self, block: TransitionBlock) -> None:
-        """Stores a block as if it were new."""
-        self._sequence += 1
-        header = block.header._replace(sequence=self._sequence)
-        self._shard.add(block._replace(header=header))
-
-    def give(self, count: int) -> np.ndarray:
-        """Rows that are drawn here."""
-        return self._shard.sample(count).rows
-
-    def fetch(self, weights: list[Any]) -> int:
-        """Takes what was published."""
-        snapshot: WeightsSnapshot = ray.get(weights[0])
-        return snapshot.version
-
-
-def cpu_of_calls(hop: Any, call: Callable[[], Any], count: int = CALLS) -> tuple[float, float]:
-    """CPU seconds that one of `count` calls costs (here, there)."""
-    call()
-    there, here = ray.get(hop.cpu_s.remote()), time.process_time()
-    for _ in range(count):
-        call()
-    here = time.process_time() - here
-    return here / count, (ray.get(hop.cpu_s.remote()) - there) / count
-
-
-def measured_costs(config: RunConfig, work: Work) -> Costs:
-    """Costs of all hops, each by itself."""
-    bare = {"worker": worker_work(config), "learner": learner_work(config)}
-    found = timed_rates({name: stopwatch(one, time.process_time) for name, one in bare.items()}, ROUNDS)
-    shape, rows = env_shape(config.env), config.batch_size * config.updates_per_call
-    learner, worker = Learner(learner_settings(config, shape)), RolloutWorker(rollout_settings(config), 0, 0)
-    worker.set_weights(learner.weights(0.0))
-    block = worker.collect(0.1)
-    connect(2, None)
-    try:
-        hop = ray.remote(num_cpus=1)(Hop).remote(config, block)
-        ask, do = cpu_of_calls(hop, lambda: ray.get(hop.nothing.remote()))
-        push, store = cpu_of_calls(hop, lambda: ray.get(hop.store.remote(block)))
-        take, give = cpu_of_calls(hop, lambda: ray.get(hop.give.remote(rows)))
-        publish, _ = cpu_of_calls(hop, lambda: ray.put(learner.weights(0.0)))
-        fetch = cpu_of_calls(hop, lambda: ray.get(hop.fetch.remote([ray.put(learner.weights(0.0))])))[1] - do
-    finally:
-        ray.shutdown()
-    return Costs(
-        env_step=1 / spread(found["worker"]).median,
-        update=1 / spread(found["learner"]).median,
-        draw=cpu_of_a_draw(config, block, rows),
-        ask=ask,
-        do=do,
-        push=push,
-        store=store,
-        give=max(0.0, give - do) / rows,
-        take=max(0.0, take - ask) / rows,
-        publish=publish,
-        fetch=max(0.0, fetch),
-    )
-
-
-def cpu_of_a_draw(config: RunConfig, block: TransitionBlock, count: int) -> float:
-    """CPU seconds of a row that is drawn in its own process."""
-    hop = Hop(config, block)
-
-    def draw() -> int:
-        hop.give(count)
-        return count
-
-    return 1 / spread(timed_rates({"draw": stopwatch(draw, time.process_time)}, 20)["draw"]).median
 
 
 class Point(NamedTuple):
@@ -291,7 +196,7 @@ def main() -> None:
     never = {"total_env_steps": 10**9, "eval_every_env_steps": 10**9, "checkpoint_every_env_steps": 10**9}
     config = RunConfig(**never)
     work, cores = work_of(config), psutil.cpu_count() or 1
-    costs = measured_costs(config, work)
+    costs = measured_costs(config)
     points = {}
     for workers, samples in POINTS:
         points[workers, samples] = measured_point(
