@@ -65,14 +65,13 @@ class ShardNode:
         keep_large_apart()  # blocks come and go here
         self.shard = make_shard(settings)
         self._writer = PartWriter()
-        self._version = -1
-        self._weights: Ref = None
+        self._weights: WeightsSnapshot | None = None
         self._known: dict[int, deque[tuple[int, int]]] = {}
         self._delivered: dict[int, tuple[int, Delivered]] = {}
 
-    def publish(self, version: int, weights: list[Ref]) -> None:
-        """Hands out `weights[0]`, a reference in a list so that it travels as one, from now on."""
-        self._version, self._weights = version, weights[0]
+    def publish(self, weights: WeightsSnapshot) -> None:
+        """Hands out these weights from now on, in the replies themselves: a reference would cost a round trip more."""
+        self._weights = weights
 
     def add(self, block: TransitionBlock) -> AddReply:
         """Stores a block; the reply carries newer weights than the block's, if there are any."""
@@ -83,8 +82,9 @@ class ShardNode:
         if not stored.duplicate:
             known.append((header.incarnation, header.sequence))
             self._note_delivery(block)
-        newer = self._version > header.policy_version
-        return AddReply(stored.rows, stored.duplicate, self._version, self._weights if newer else None, outdated)
+        version = -1 if self._weights is None else self._weights.version
+        newer = self._weights if version > header.policy_version else None
+        return AddReply(stored.rows, stored.duplicate, version, newer, outdated)
 
     def _note_delivery(self, block: TransitionBlock) -> None:
         header = block.header
@@ -266,12 +266,8 @@ class RolloutNode:
             return _report(push, reply, Dropped.OUTDATED if reply.outdated else Dropped.DUPLICATE)
 
     def _take_weights(self, reply: AddReply) -> None:
-        if reply.weights is None or reply.weights_version <= self._worker.policy_version:
-            return
-        try:
-            self._worker.set_weights(self._calls.get(reply.weights))
-        except CallFailed:
-            return  # lost with the learner that made them; the next learner's come with the replies to come
+        if reply.weights is not None and reply.weights_version > self._worker.policy_version:
+            self._worker.set_weights(reply.weights)
 
     def save(self, location: Location) -> dict[str, Any]:
         """Starts to write the worker's arrays as they are now to the file `location`; `saved` tells of its end.

@@ -56,7 +56,7 @@ class TransitionBlock(NamedTuple):
 class AddReply(NamedTuple):
     """A shard's answer to a push: what was stored, and newer weights if there are any.
 
-    `weights` is a reference to a WeightsSnapshot, None if the block came from the newest version. A `duplicate` is
+    `weights` is a WeightsSnapshot, None if the block came from the newest version. A `duplicate` is
     refused; it is `outdated` if it was never stored, for its worker has been replaced or a later block overtook it.
     """
 

@@ -107,7 +107,7 @@ def process_cluster(config: RunConfig, incarnation: int) -> Cluster:
     calls = LocalCalls()
     shape = env_shape(config.env)
     shards: list[Node] = [ShardNode(settings) for settings in shard_settings(config, shape)]
-    learner = LearnerNode(learner_settings(config, shape), shards, calls, calls)
+    learner = LearnerNode(learner_settings(config, shape), shards, calls)
     targets = [learner] if config.replay_placement == "learner" else shards
 
     def place_worker(worker_id: int, incarnation: int) -> Node:

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from actors.calls import Ref
 from actors.evaluator import evaluate, evaluate_in_parts
 from actors.exploration import epsilon
 from actors.faults import CallFailed, Part, PartFailed, PartKind, Recovery, RunFailed
@@ -23,7 +22,6 @@ from learner.config import RunConfig
 from learner.journal import Journal, Row
 from learner.ledger import Ledger
 from learner.mending import FaultObserver, Mender, RunLost
-from learner.node import UpdateReport
 from learner.pacing import make_pacer
 from learner.progress import Progress
 from learner.results import as_metrics, summarise
@@ -81,7 +79,7 @@ class TrainingLoop:
         self._mender = Mender(cluster, recovery or Recovery(), self._under_way, self._pacer, self._ledger, observer)
         checkpointer = Checkpointer(checkpoints, cluster.calls, cluster.queue_deadline_s)
         self._saver = Saver(config, keep_best, checkpointer, self._mender, self._progress, journal, observer)
-        self._weights: Ref = None
+        self._restored = False
 
     @property
     def env_steps(self) -> int:
@@ -117,7 +115,7 @@ class TrainingLoop:
             raise
 
     def _run(self) -> bool:
-        if self._weights is None:
+        if not self._restored:
             self._send_first_weights()
         self._progress.meters.start_clock()
         while self.env_steps < self._config.total_env_steps and not self._stop():
@@ -133,10 +131,10 @@ class TrainingLoop:
         return self.env_steps >= self._config.total_env_steps
 
     def _send_first_weights(self) -> None:
-        self._weights = self._mender.ask(LEARNER, "weights")[0]
+        weights = self.newest_weights()
         for worker in self._mender.workers:
             try:
-                self._mender.ask(worker, "set_weights", self._weights)
+                self._mender.ask(worker, "set_weights", weights)
             except PartFailed as failure:
                 self._mend(failure)
 
@@ -168,7 +166,7 @@ class TrainingLoop:
 
     def _start_evaluation(self) -> None:
         seeds = list(range(EVAL_SEED, EVAL_SEED + self._config.eval_episodes))
-        ref = self._calls.run(evaluate, self._config.env, self._weights, seeds)
+        ref = self._calls.run(evaluate, self._config.env, self._mender.newest_weights(), seeds)
         self._under_way.add(ref, Pending("eval", EVALUATOR, self._mender.incarnation(EVALUATOR), self.env_steps))
 
     def _start(self, part: Part, method: str, amount: int, *args: Any) -> None:
@@ -200,7 +198,7 @@ class TrainingLoop:
         if pending.kind == "collect":
             self._take_blocks(result)
         elif pending.kind == "update":
-            self._take_updates(result, pending.amount)
+            self._progress.take_updates(result, pending.amount)
         else:
             self._take_evaluation(result, pending.amount)
 
@@ -210,7 +208,7 @@ class TrainingLoop:
         self._mend(failure)
 
     def _mend(self, failure: PartFailed) -> None:
-        unreported = self._mender.mend(failure, self._weights)
+        unreported = self._mender.mend(failure)
         self._progress.env_steps += unreported.env_steps
         if failure.part == EVALUATOR:
             self._start_evaluation()
@@ -222,10 +220,6 @@ class TrainingLoop:
             failure = self._mender.check_push(report)
             if failure is not None:
                 self._mend(failure)
-
-    def _take_updates(self, report: UpdateReport, updates: int) -> None:
-        self._progress.take_updates(report, updates)
-        self._weights = report.weights[0]
 
     def _take_evaluation(self, stats: EpisodeStats, env_steps: int) -> None:
         metrics = {f"eval/{name}": value for name, value in as_metrics(summarise(stats)).items()}
@@ -282,7 +276,8 @@ class TrainingLoop:
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Takes up a checkpoint of this config; call before `run` (see `Saver.restore` for errors)."""
-        self._weights = self._saver.restore(checkpoint)
+        self._saver.restore(checkpoint)
+        self._restored = True
 
     def lost(self, failure: PartFailed) -> RunLost:
         """Ends this attempt because of a failure outside of the rounds of training (see `run` for other errors)."""
@@ -308,8 +303,5 @@ class TrainingLoop:
         Raises:
           PartFailed: they are gone with the learner.
         """
-        try:
-            weights: WeightsSnapshot = self._calls.get(self._weights)
-        except CallFailed as failure:
-            raise PartFailed(LEARNER, self._mender.incarnation(LEARNER), failure.fault, failure.reason) from failure
+        weights: WeightsSnapshot = self._mender.ask(LEARNER, "weights")
         return weights

@@ -118,6 +118,10 @@ class Mender:
         self._under_way.heard(part)
         return answer
 
+    def newest_weights(self) -> Ref:
+        """A reference to the learner's weights, which may not be there yet."""
+        return self._cluster.calls.start(self._cluster.learner, "weights")
+
     def target(self, index: int) -> Part:
         """What workers push to under this index."""
         return Part(PartKind.SHARD, index) if self._cluster.shards_are_parts else Part(PartKind.LEARNER)
@@ -164,12 +168,11 @@ class Mender:
             raise RunLost(failure, self.highest)
         return decision.action
 
-    def mend(self, failure: PartFailed, weights: Ref) -> Delivered:
+    def mend(self, failure: PartFailed) -> Delivered:
         """Does what there is to do about a failure; nothing if the part has been replaced since.
 
         Args:
           failure: which part, and how.
-          weights: what a new worker acts with.
 
         Returns:
           What a lost worker had stored without a report.
@@ -187,18 +190,18 @@ class Mender:
         while True:
             try:
                 if failure.part.kind is PartKind.WORKER:
-                    return self._restart_worker(failure.part, weights)
+                    return self._restart_worker(failure.part)
                 return self._restart_shard(failure.part)
             except PartFailed as another:
                 if another.part == failure.part:
-                    return self.mend(another, weights)
-                self.mend(another, weights)
+                    return self.mend(another)
+                self.mend(another)
 
     def _next_incarnation(self) -> int:
         self.highest += 1
         return self.highest
 
-    def _restart_worker(self, part: Part, weights: Ref) -> Delivered:
+    def _restart_worker(self, part: Part) -> Delivered:
         cluster, index = self._cluster, part.number
         cluster.discard(cluster.workers[index])
         closed, incarnation = self.incarnation(part), self._next_incarnation()
@@ -212,7 +215,7 @@ class Mender:
         for target in targets:
             if target in self._incarnations:
                 self._tell(index, target)
-        cluster.calls.start(worker, "set_weights", weights)
+        cluster.calls.start(worker, "set_weights", self.newest_weights())
         return unreported
 
     def _restart_shard(self, part: Part) -> Delivered:

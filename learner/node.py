@@ -14,6 +14,7 @@ from safetensors.torch import load_file, save_file
 from actors.calls import Calls, Node, Ref
 from actors.faults import CallFailed, Part, PartFailed, PartKind
 from actors.locations import Location, fetched, inside
+from actors.network import WeightsSnapshot
 from actors.nodes import ShardNode
 from actors.parts import PartWriter, Written, join_written
 from actors.stopwatch import Stopwatch
@@ -30,14 +31,13 @@ WEIGHTS = "learner.safetensors"
 
 
 class UpdateReport(NamedTuple):
-    """What a call of updates gives back: their means, the version reached, and a reference to the weights.
+    """What a call of updates gives back: their means, and the version reached.
 
     `seconds` says where the learner's time went since its last report (see SAMPLES, UPDATES, PUBLISHES, WAITS).
     """
 
     stats: UpdateStats
     version: int
-    weights: list[Ref]
     seconds: dict[str, float]
 
 
@@ -60,21 +60,18 @@ class LearnerNode:
       settings: see LearnerSettings.
       shards: nodes with `sample`, `set_priorities`, `publish`, `mass`, `save`, `saved`, `load`.
       shard_calls: how to call the shards.
-      calls: how to share weights with rollout workers.
     """
 
-    def __init__(self, settings: LearnerSettings, shards: list[Node], shard_calls: Calls, calls: Calls) -> None:
+    def __init__(self, settings: LearnerSettings, shards: list[Node], shard_calls: Calls) -> None:
         torch.set_num_threads(1)
         self._settings = settings
         self._learner = Learner(settings)
         self._shards = list(shards)
         self._shard_incarnations = [0] * len(shards)
         self._shard_calls = shard_calls
-        self._calls = calls
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence((settings.seed, 1))))
         self._masses = np.zeros(len(shards), np.float64)
         self._answers: dict[int, Ref] = {}
-        self._weights: Ref = None
         self._writer = PartWriter()
         self._watch = Stopwatch()
         self.publish()
@@ -95,7 +92,7 @@ class LearnerNode:
         self._shards[index], self._shard_incarnations[index] = shard, incarnation
         self._masses[index] = 0.0
         self._answers.pop(index, None)
-        self._shard_calls.start(shard, "publish", self._learner.updates, [self._weights])
+        self._shard_calls.start(shard, "publish", self._weights)
 
     def _result(self, index: int, ref: Ref) -> Any:
         """What a call of the shard of this index gave.
@@ -128,20 +125,15 @@ class LearnerNode:
         self._watch.lap(UPDATES)
         if sample.draws is not None:
             self._answer(sample)
-        published = self.publish()
+        self.publish()
         self._watch.lap(PUBLISHES)
-        return UpdateReport(stats, self._learner.updates, published, self._watch.take())
+        return UpdateReport(stats, self._learner.updates, self._watch.take())
 
-    def publish(self) -> list[Ref]:
-        """Shares the newest weights with all shards, whose replies carry them to the workers.
-
-        Returns:
-          A reference to the WeightsSnapshot, in a list so that it travels as a reference.
-        """
-        self._weights = self._calls.put(self._learner.weights(time.time()))
+    def publish(self) -> None:
+        """Shares the newest weights with all shards, whose replies carry them to the workers."""
+        self._weights = self._learner.weights(time.time())
         for shard in self._shards:
-            self._shard_calls.start(shard, "publish", self._learner.updates, [self._weights])
-        return [self._weights]
+            self._shard_calls.start(shard, "publish", self._weights)
 
     def _sample(self, count: int) -> Sample:
         """Draws rows from the shards in proportion to their masses, in random order."""
@@ -220,7 +212,7 @@ class LearnerNode:
             raise failures[0]
         return written
 
-    def load(self, folder: Location, state: dict[str, Any]) -> list[Ref]:
+    def load(self, folder: Location, state: dict[str, Any]) -> None:
         """Takes up what `save` wrote and returned; publishes the weights (see `publish`).
 
         Raises:
@@ -243,11 +235,11 @@ class LearnerNode:
         self._rng.bit_generator.state = state["rng"]
         self._answers.clear()
         self._masses[:] = state["sizes"]
-        return self.publish()
+        self.publish()
 
-    def weights(self) -> list[Ref]:
-        """A reference to the newest weights, in a list."""
-        return [self._weights]
+    def weights(self) -> WeightsSnapshot:
+        """The newest weights."""
+        return self._weights
 
 
 def _shard_folder(folder: Location, shard: int) -> Location:

@@ -129,9 +129,9 @@ def _make_learner(config: RunConfig, shards: list[Node], calls: RayCalls) -> Lea
     """Builds the learner in its actor; without shard actors, its shards too."""
     shape = env_shape(config.env)
     if shards:
-        return LearnerNode(learner_settings(config, shape), shards, calls, calls)
+        return LearnerNode(learner_settings(config, shape), shards, calls)
     embedded: list[Node] = [ShardNode(settings) for settings in shard_settings(config, shape)]
-    return LearnerNode(learner_settings(config, shape), embedded, LocalCalls(), calls)
+    return LearnerNode(learner_settings(config, shape), embedded, LocalCalls())
 
 
 class LearnerActor(LearnerNode):

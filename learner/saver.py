@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from actors.calls import Ref
 from actors.faults import Part, PartFailed, PartKind
 from actors.locations import Location, inside
 from learner.checkpoint import Checkpoint, Keep
@@ -142,23 +141,19 @@ class Saver:
         self._saved, self._saved_at = ended.location, (moment.env_steps, moment.updates)
         return None
 
-    def restore(self, checkpoint: Checkpoint) -> Ref:
+    def restore(self, checkpoint: Checkpoint) -> None:
         """Takes up a checkpoint of this config.
-
-        Returns:
-          A reference to the learner's weights.
 
         Raises:
           ValueError: its files do not fit this run.
           PartFailed: a part failed.
         """
         folder, state = checkpoint
-        weights: Ref = self._mender.ask(LEARNER, "load", folder, state["learner"])[0]
+        self._mender.ask(LEARNER, "load", folder, state["learner"])
         for worker in self._mender.workers:
             self._mender.ask(worker, "load", _worker_file(folder, worker), state["workers"][worker.number])
         self._progress.set_state(state)
         self._saved, self._saved_at = folder, (self._progress.env_steps, self._progress.updates)
-        return weights
 
 
 def _worker_file(folder: Location, worker: Part) -> Location:

@@ -82,7 +82,7 @@ def test_what_is_stored_is_what_the_worker_collected(make_node, make_shard, sett
 def test_newer_weights_come_with_the_reply(make_node, make_shard, swarm, make_weights):
     shard = make_shard()
     node = make_node([shard])
-    shard.publish(13, [Done(make_weights(swarm, seed=1, version=13, time_s=200.0))])
+    shard.publish(make_weights(swarm, seed=1, version=13, time_s=200.0))
     first, second = node.collect(0.0)[0], node.collect(0.0)[0]
     assert (first.header.policy_version, first.staleness_updates) == (10, 3)
     assert (second.header.policy_version, second.header.policy_time_s, second.staleness_updates) == (13, 200.0, 0)
@@ -93,7 +93,7 @@ def test_weights_that_are_not_newer_do_not_travel(make_node, make_shard, swarm, 
     shard = make_shard()
     node = make_node([shard])
     if version >= 0:
-        shard.publish(version, ["no reference: must not be looked up"])
+        shard.publish(make_weights(swarm, seed=1, version=version))
     reports = [node.collect(0.0)[0] for _ in range(2)]
     assert [report.header.policy_version for report in reports] == [10, 10]
     assert [report.staleness_updates for report in reports] == [0, 0]
@@ -103,7 +103,7 @@ def test_a_late_reply_does_not_bring_older_weights_back(make_node, make_shard, s
     shards, calls = [make_shard(), make_shard()], DeferredCalls()
     node = make_node(shards, calls, pushes_in_flight=2)
     for shard, version in zip(shards, (15, 12), strict=True):
-        shard.publish(version, [Done(make_weights(swarm, version=version))])
+        shard.publish(make_weights(swarm, version=version))
     assert node.collect(0.0) == node.collect(0.0) == []
     assert [report.staleness_updates for report in node.settle()] == [5, 2]
     node.collect(0.0)
@@ -251,15 +251,6 @@ def test_a_fenced_worker_is_refused_and_its_deliveries_are_told(make_shard, sett
     assert shard.fence(0, 3, 4) == Delivered()
     assert shard.add(workers[1].collect(0.5)).outdated, "fenced before it delivered anything"
     assert shard.fence(1, 0, 1) == Delivered(), "another worker"
-
-
-def test_lost_weights_leave_a_worker_with_those_it_has(make_node, make_shard, swarm, make_weights):
-    shard = make_shard()
-    node = make_node([shard], Unreliable())
-    shard.publish(13, [(Fault.OBJECT_LOST, None)])
-    assert [node.collect(0.0)[0].header.policy_version for _ in range(2)] == [10, 10]
-    shard.publish(14, [Done(make_weights(swarm, version=14))])
-    assert [node.collect(0.0)[0].header.policy_version for _ in range(2)] == [10, 14]
 
 
 def test_a_worker_whose_weights_were_lost_on_their_way_says_so(settings, make_shard):

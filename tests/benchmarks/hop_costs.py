@@ -27,7 +27,8 @@ CALLS = 200
 class Hop:
     """The far side of every kind of call, as a Ray actor."""
 
-    def __init__(self, config: RunConfig, block: TransitionBlock) -> None:
+    def __init__(self, config: RunConfig, block: TransitionBlock, weights: WeightsSnapshot) -> None:
+        self._weights = weights
         self._shard = make_shard(shard_settings(config, env_shape(config.env))[0])
         self._sequence = 0
         while self._shard.size < config.replay_capacity:
@@ -40,20 +41,16 @@ class Hop:
     def nothing(self) -> None:
         """An order that is done at once."""
 
-    def store(self, block: TransitionBlock) -> None:
-        """Stores a block as if it were new."""
+    def store(self, block: TransitionBlock) -> WeightsSnapshot:
+        """Stores a block as if it were new; the reply carries weights."""
         self._sequence += 1
         header = block.header._replace(sequence=self._sequence)
         self._shard.add(block._replace(header=header))
+        return self._weights
 
     def give(self, count: int) -> np.ndarray:
         """Rows that are drawn here."""
         return self._shard.sample(count).rows
-
-    def fetch(self, weights: list[Any]) -> int:
-        """Takes what was published."""
-        snapshot: WeightsSnapshot = ray.get(weights[0])
-        return snapshot.version
 
 
 def cpu_of_calls(hop: Any, call: Callable[[], Any], count: int = CALLS) -> tuple[float, float]:
@@ -76,12 +73,11 @@ def measured_costs(config: RunConfig) -> Costs:
     block = worker.collect(0.1)
     connect(2, None)
     try:
-        hop = ray.remote(num_cpus=1)(Hop).remote(config, block)
+        hop = ray.remote(num_cpus=1)(Hop).remote(config, block, learner.weights(0.0))
         ask, do = cpu_of_calls(hop, lambda: ray.get(hop.nothing.remote()))
         push, store = cpu_of_calls(hop, lambda: ray.get(hop.store.remote(block)))
         take, give = cpu_of_calls(hop, lambda: ray.get(hop.give.remote(rows)))
-        publish, _ = cpu_of_calls(hop, lambda: ray.put(learner.weights(0.0)))
-        fetch = cpu_of_calls(hop, lambda: ray.get(hop.fetch.remote([ray.put(learner.weights(0.0))])))[1] - do
+        publish, _ = cpu_of_calls(hop, lambda: learner.weights(0.0))
     finally:
         ray.shutdown()
     return Costs(
@@ -95,13 +91,12 @@ def measured_costs(config: RunConfig) -> Costs:
         give=max(0.0, give - do) / rows,
         take=max(0.0, take - ask) / rows,
         publish=publish,
-        fetch=max(0.0, fetch),
     )
 
 
 def cpu_of_a_draw(config: RunConfig, block: TransitionBlock, count: int) -> float:
     """CPU seconds of a row that is drawn in its own process."""
-    hop = Hop(config, block)
+    hop = Hop(config, block, WeightsSnapshot(0, 0.0, ()))
 
     def draw() -> int:
         hop.give(count)

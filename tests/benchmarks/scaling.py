@@ -102,12 +102,11 @@ def cost_table(costs: Costs, work: Work) -> Table:
         "draw": "a row drawn in the learner's process",
         "ask": "a call, who asks",
         "do": "a call, who answers",
-        "push": f"a block of {work.block_env_steps:,} transitions, who pushes",
+        "push": f"a block of {work.block_env_steps:,} transitions, with weights in the reply, who pushes",
         "store": "the same, who stores",
         "give": "a row drawn in another process, there",
         "take": "the same, at the learner",
-        "publish": "weights, who publishes",
-        "fetch": "weights, who fetches",
+        "publish": "new weights, at the learner",
     }
     for name, text in what.items():
         table.add_row(name, microseconds(getattr(costs, name)), text)

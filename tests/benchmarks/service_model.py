@@ -13,9 +13,9 @@ class Costs(NamedTuple):
     """CPU seconds, each measured by itself.
 
     `env_step` of a rollout worker and `update` of the learner are those of the bare parts; the learner's `draw` is
-    of one row from a shard in its own process. A call costs who asks `ask` and who does it `do`. A block costs who
-    pushes it `push` and who stores it `store`; a row that another process drew costs `give` there and `take` here.
-    Weights cost the learner `publish`, and whoever fetches them `fetch`.
+    of one row from a shard in its own process. A call costs who asks `ask` and who does it `do`. A block, with weights
+    in the reply, costs who pushes it `push` and who stores it `store`; a row that another process drew costs `give`
+    there and `take` here. New weights cost the learner `publish`.
     """
 
     env_step: float
@@ -28,7 +28,6 @@ class Costs(NamedTuple):
     give: float
     take: float
     publish: float
-    fetch: float
 
 
 class Work(NamedTuple):
@@ -60,7 +59,7 @@ WORKERS, LEARNER, SHARDS, DRIVER, CORES = "rollout workers", "learner", "replay 
 def seconds_per_env_step(costs: Costs, work: Work, own_shards: bool) -> dict[str, float]:
     """CPU seconds per env step of each hop, all its processes together; shards are hops where they have their own."""
     rows, blocks, calls = work.samples_per_insert, 1 / work.block_env_steps, work.calls_per_env_step
-    worker = costs.env_step + blocks * (costs.do + costs.push + costs.fetch)  # new weights with each block's reply
+    worker = costs.env_step + blocks * (costs.do + costs.push)
     learner = rows / work.batch_size * costs.update + calls * (costs.do + costs.publish)
     driver = (blocks + calls) * costs.ask
     if own_shards:
@@ -85,7 +84,7 @@ def saturation(costs: Costs, work: Work, own_shards: bool) -> dict[str, float]:
 
 
 def network_bytes(work: Work, own_shards: bool) -> float:
-    """Bytes between processes per env step: blocks, samples where shards have processes of their own, weights."""
+    """Bytes between processes per env step: blocks, weights in their replies, samples of shards in other processes."""
     samples = work.samples_per_insert if own_shards else 0.0
     return (1 + samples) * work.row_bytes + work.weights_bytes / work.block_env_steps
 

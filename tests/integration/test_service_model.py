@@ -39,10 +39,10 @@ def test_a_free_network_leaves_env_steps_and_updates():
 
 
 def test_calls_and_blocks_are_shared_by_their_env_steps():
-    costs = FREE._replace(do=1.0, push=10.0, fetch=100.0, store=1000.0, publish=1e4, ask=1e5)
+    costs = FREE._replace(do=1.0, push=10.0, store=1000.0, publish=1e4, ask=1e5)
     calls = 1 / 100  # of updates: 4 x 50 samples are 100 env steps' share
     assert seconds_per_env_step(costs, WORK, False) == pytest.approx(
-        {WORKERS: 1.11, LEARNER: calls * 10_001 + 10.0, DRIVER: (1 / 100 + calls) * 1e5}
+        {WORKERS: 0.11, LEARNER: calls * 10_001 + 10.0, DRIVER: (1 / 100 + calls) * 1e5}
     )
 
 

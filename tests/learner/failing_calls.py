@@ -36,10 +36,21 @@ class FailingCalls(LocalCalls):
         self._turn = threading.RLock()
 
     def start(self, node, method, *args):
-        later = Later(node, method, [arg.value if isinstance(arg, Done) else arg for arg in args])
+        later = Later(node, method, args)
         with self._turn:
             self._queues[id(node)].append(later)
         return later
+
+    def run(self, function, *args):
+        try:
+            return Done(function(*map(self._value, args)))
+        except CallFailed as error:  # of a call whose result is an argument
+            later = Later(None, function, args)
+            later.ran, later.error = True, error
+            return later
+
+    def _value(self, arg):
+        return self.get(arg) if isinstance(arg, Done | Later) else arg
 
     def wait(self, refs, timeout_s):
         """Some of `refs`, at least one; none before an earlier one of its node."""
@@ -77,7 +88,7 @@ class FailingCalls(LocalCalls):
             if fault.endswith("before"):
                 return
         try:
-            later.result = getattr(node, method)(*args)
+            later.result = getattr(node, method)(*map(self._value, args))
         except Exception as error:
             later.error = later.error or error
 

@@ -200,7 +200,7 @@ def test_the_old_incarnation_of_a_worker_is_refused_everywhere(run, config):
     ((failure, _),) = listener.failures
     stored = loop._progress.ledger.stored
     zombie = RolloutNode(cluster_module.rollout_settings(config), failure.part.number, 0, calls, cluster.targets, 0)
-    zombie.set_weights(calls.get(loop._weights))
+    zombie.set_weights(loop.newest_weights())
     zombie._worker._sequence = 1_000  # blocks that no shard has seen
     for _ in range(3):
         (report,) = zombie.collect(0.5)

@@ -30,8 +30,8 @@ def filled():
     meters = Meters()
     meters.take_block(report([1, 2, 1], [4.0, -1.0, 3.0], [10, 20, 60], staleness_updates=3, staleness_s=0.5, rate=0.8))
     meters.take_block(report([5], [-2.0], [30], staleness_updates=1, staleness_s=1.5, rate=0.7))
-    meters.take_updates(UpdateReport(UpdateStats(1.0, 2.0, 3.0), 8, [], {"updates": 3.0, "waits": 0.5}), 8)
-    meters.take_updates(UpdateReport(UpdateStats(2.0, 4.0, 6.0), 16, [], {"updates": 4.0, "samples": 0.5}), 8)
+    meters.take_updates(UpdateReport(UpdateStats(1.0, 2.0, 3.0), 8, {"updates": 3.0, "waits": 0.5}), 8)
+    meters.take_updates(UpdateReport(UpdateStats(2.0, 4.0, 6.0), 16, {"updates": 4.0, "samples": 0.5}), 8)
     return meters
 
 

@@ -32,7 +32,7 @@ def make_learner(learner_settings, make_rows):
     def make(num_shards=1, capacity=50, priorities=None, calls=None, **other):
         settings = [ShardSettings(make_rows(0).dtype, capacity, seed, priorities) for seed in range(num_shards)]
         shards = [ShardNode(setting) for setting in settings]
-        return LearnerNode(learner_settings._replace(**other), shards, calls or LocalCalls(), LocalCalls()), shards
+        return LearnerNode(learner_settings._replace(**other), shards, calls or LocalCalls()), shards
 
     return make
 
@@ -78,7 +78,7 @@ class ShardContract:
         replies = [node.add(make_block(make_rows(3), version, version=version)) for version in range(4)]
         assert [reply.weights_version for reply in replies] == [2] * 4
         assert [reply.weights is None for reply in replies] == [False, False, True, True]
-        weights = LocalCalls().get(replies[0].weights)
+        weights = replies[0].weights
         assert isinstance(weights, WeightsSnapshot) and weights.version == 2
 
 
@@ -91,7 +91,7 @@ class TestShardInANodeOfItsOwn(ShardContract):
 
         def publish():
             version = next(versions)
-            node.publish(version, [Done(WeightsSnapshot(version, 0.0, ()))])
+            node.publish(WeightsSnapshot(version, 0.0, ()))
 
         return node, node, publish
 
@@ -128,13 +128,13 @@ def test_embedded_shards_take_blocks_in_turn(make_learner, make_rows):
 def test_an_update_learns_publishes_and_reports(make_learner, make_rows):
     learner, (shard,) = make_learner()
     learner.add(make_block(make_rows(40)))
-    before = learner.weights()[0].value
+    before = learner.weights()
     report = learner.update(3, RATE)
-    after = report.weights[0].value
+    after = learner.weights()
     assert (before.version, report.version, after.version) == (0, 3, 3)
-    assert after.time_s >= before.time_s and learner.weights() == report.weights
+    assert after.time_s >= before.time_s
     assert any(not np.array_equal(a, b) for a, b in zip(before.arrays, after.arrays, strict=True))
-    assert shard.add(make_block(make_rows(1), 1)).weights is report.weights[0]
+    assert shard.add(make_block(make_rows(1), 1)).weights is after
 
 
 @pytest.mark.parametrize("sizes", [(50, 50), (40, 10), (10, 30, 20)])
@@ -177,14 +177,14 @@ def test_a_saved_node_goes_on_bit_by_bit(tmp_path, make_learner, make_rows, num_
         learner.add(make_block(make_rows(30, seed=sequence), sequence))
     learner.update(4, RATE, 0.5)
     state = json.loads(json.dumps(saved(learner, tmp_path)))
-    expected = [learner.update(4, RATE, 0.5) for _ in range(2)]
+    expected = [(learner.update(4, RATE, 0.5), learner.weights()) for _ in range(2)]
     resumed, again = make_learner(num_shards, priorities=priorities, seed=99)
-    weights = resumed.load(tmp_path, state)
-    assert weights[0].value.version == 4
-    for report in expected:
+    resumed.load(tmp_path, state)
+    assert resumed.weights().version == 4
+    for report, weights in expected:
         other = resumed.update(4, RATE, 0.5)
         assert (other.stats, other.version) == (report.stats, report.version)
-        for first, second in zip(other.weights[0].value.arrays, report.weights[0].value.arrays, strict=True):
+        for first, second in zip(resumed.weights().arrays, weights.arrays, strict=True):
             np.testing.assert_array_equal(first, second)
     assert [shard.mass() for shard in again] == [shard.mass() for shard in shards]
     assert [shard.add(make_block(make_rows(1), 9)).weights_version for shard in again] == [12] * num_shards
@@ -196,9 +196,9 @@ def test_a_loaded_node_publishes_its_weights(tmp_path, make_learner, make_rows):
     learner.update(4, RATE)
     state = saved(learner, tmp_path)
     resumed, (again,) = make_learner()
-    weights = resumed.load(tmp_path, state)
-    assert weights == resumed.weights() and weights[0].value.version == 4
-    assert again.add(make_block(make_rows(1), 9)).weights is weights[0]
+    resumed.load(tmp_path, state)
+    assert resumed.weights().version == 4
+    assert again.add(make_block(make_rows(1), 9)).weights is resumed.weights()
 
 
 def test_another_number_of_shards_is_refused(tmp_path, make_learner, make_rows):
@@ -248,7 +248,7 @@ def td_errors_by_hand(weights, rows):
 def test_td_errors_go_back_to_the_rows_that_they_are_of(make_learner, make_rows, sizes):
     learner, shards = make_learner(len(sizes), priorities=HALF)
     fill(learner, shards, make_rows, sizes)
-    weights, sampled, real = learner.weights()[0].value, [], learner._sample
+    weights, sampled, real = learner.weights(), [], learner._sample
     learner._sample = lambda count: sampled.append(real(count)) or sampled[0]
     learner.update(1, RATE, 1.0)
     drawn = {round(reward) for reward in sampled[0].rows["reward"].tolist()}
@@ -288,11 +288,12 @@ def test_updates_count_their_rows_by_importance(make_learner, make_rows, learner
     for copy in (shard, other):
         copy.add(make_block(make_rows(50)))
         copy.set_priorities(np.arange(50), np.geomspace(0.1, 9, 50).astype(np.float32))
-    report, plain = learner.update(3, RATE, exponent), Learner(learner_settings)
+    learner.update(3, RATE, exponent)
+    plain = Learner(learner_settings)
     sample = other.sample(3 * 16)
     probability = other.shard.priorities[sample.draws.number] / other.shard.priorities.sum()
     plain.update(sample.rows, RATE, importance_weights(probability, 16, exponent))
-    for array, expected in zip(report.weights[0].value.arrays, plain.weights(0.0).arrays, strict=True):
+    for array, expected in zip(learner.weights().arrays, plain.weights(0.0).arrays, strict=True):
         np.testing.assert_array_equal(array, expected)
 
 
