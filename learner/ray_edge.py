@@ -40,8 +40,8 @@ from learner.place import DEADLINE_S, Place
 from learner.ray_auth import HOW, guard_ray
 from sim_core.checks import ConfigError, require
 
-PUSHES_IN_FLIGHT = 1
-"""Pushes of a worker that may be under way while it collects the next block."""
+PUSHES_IN_FLIGHT = 2
+"""Pushes of a worker that may be under way while it collects: shards that live with the learner wait for updates."""
 COLLECTS_IN_FLIGHT = 2
 """Collects of a worker that are started ahead, so that it never waits for the driver."""
 UPDATES_IN_FLIGHT = 2

@@ -163,21 +163,24 @@ def saturation_table(costs: Costs, work: Work) -> Table:
 
 def draw(points: dict[tuple[int, float], Point], costs: Costs, work: Work, cores: int) -> None:
     """The picture: predictions as lines, what was measured as points."""
-    figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
+    figure, axes = plt.subplots(figsize=(9, 5), layout="constrained")
     counts = np.geomspace(1, 64, 49)
     for i, samples in enumerate(sorted({samples for _, samples in points})):
         here = work._replace(samples_per_insert=samples)
-        for limit, style, where in ((np.inf, "--", "a core for every process"), (cores, "-", f"{cores} cores")):
+        for limit, style, where in ((np.inf, "--", "a core a process"), (cores, "-", f"{cores} cores")):
             rates = [bounds(costs, here, count, cores=limit)[0].env_steps_per_s for count in counts]
-            label = f"model, {samples:g} samples per insert, {where}"
-            axes.plot(counts, rates, style, color=f"C{i}", label=label)
+            axes.plot(counts, rates, style, color=f"C{i}", label=f"{samples:g} samples/insert, model: {where}")
         mine = {workers: point.env_steps_per_s for (workers, of), point in points.items() if of == samples}
-        axes.plot(list(mine), list(mine.values()), "o", color=f"C{i}", label=f"measured, {cores} cores")
+        axes.plot(list(mine), list(mine.values()), "o", color=f"C{i}", label=f"measured on {cores} cores")
     axes.set(xscale="log", yscale="log", xlabel="rollout workers", ylabel="env steps/s")
     axes.set_xticks([1, 2, 4, 8, 16, 32, 64], ["1", "2", "4", "8", "16", "32", "64"])
     axes.minorticks_off()
+    ticks = [number * 10**power for power in (4, 5, 6) for number in (1, 2, 5)]
+    low, high = axes.get_ylim()
+    axes.set_yticks([tick for tick in ticks if low <= tick <= high])
+    axes.yaxis.set_major_formatter("{x:,.0f}")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    figure.legend(loc="outside right upper", fontsize=8)
     figure.savefig(PICTURE, dpi=120)
     plt.close(figure)
 
