@@ -92,8 +92,7 @@ class Lap:
 
         Args:
           env_steps, updates: so far.
-          weights: gives the policy for the judge; None where the training has a judge of its own, which calls
-            `judged`.
+          weights: gives the policy for the judge; None where there is no threshold.
         """
         now_s = self._now_s()
         if updates and (not self._marks or now_s >= self._marks[-1][0] + 0.05):
@@ -111,10 +110,6 @@ class Lap:
         seeds = list(range(JUDGED_FROM, JUDGED_FROM + config.eval_episodes))
         found = score(summarise(evaluate(config.env, weights, seeds)))
         self._judged_s += time.perf_counter() - start_s
-        self.judged(found)
-
-    def judged(self, found: float) -> None:
-        """Takes note of a score of the greedy policy."""
         self._score = found
         if self._heat.threshold is not None and found >= self._heat.threshold and self._reached_s is None:
             self._reached_s = self._now_s()

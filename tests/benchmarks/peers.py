@@ -3,8 +3,8 @@
 Each contest sets the environment, the network, the batch and the samples per insert. Every contender trains in a
 process of its own, one at a time, in turn; first each tries several numbers of environments and threads and keeps the
 fastest. Then come rates (env steps and updates a second once training has begun) and the time to a threshold: from the
-start of the training, environments and Ray being up, to the first evaluation that reaches it. A peer's watch stands
-still while it is evaluated; ours runs on, as its evaluations go on beside the training.
+start of the training, environments and Ray being up, to the first evaluation that reaches it. The watch stands still
+while the judge plays, and so does the training.
 """
 
 import argparse

@@ -38,16 +38,16 @@ def table(heading: str) -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def model():
-    """(bare simulator to rollout worker, env steps/s that one learner takes up), from the README's tables."""
-    updates, share = benchmark("bare learner, batch 256", 3), benchmark("service over Ray", 4)
-    kept = number(re.search(r"· ([\d.]+)", next(x for x in MEASURED.splitlines() if "service over Ray" in x))[1])
-    assert share == 0.29 and f"{updates:.0f} × {kept} × 256 / 2" in PAGE
-    return benchmark("rollout worker, one core", 4), updates * kept * 256 / 2
+    """(from the simulator's table to a rollout worker here, env steps/s that one learner takes up), from the README."""
+    (full,) = re.findall(r"full first, at\s+([\d,]+) env steps/s with 2 samples", MEASURED)
+    assert f"{benchmark('bare learner, batch 256', 3):,.0f} updates/s at batch 256" in PAGE
+    (machines,) = re.findall(r"and ([\d.]+), this machine against that one", PAGE)
+    return benchmark("rollout worker, one core", 4) * number(machines), number(full)
 
 
 def test_workers_of_a_learner_follow_from_the_benchmarks(model):
     ratio, taken_up = model
-    assert f"≈ {round(taken_up, -3):,.0f} env steps/s" in PAGE
+    assert f"full at\n{taken_up:,.0f} env steps/s with 2 samples" in PAGE
     for setup, rate, workers, cpus in table("setup"):
         if setup == "10r×2g":
             expected = benchmark("rollout worker, one core", 2)

@@ -1,32 +1,23 @@
-"""Ours, over Ray."""
+"""Ours, over Ray; the judge takes the place of the service's own evaluations, as with the peers."""
 
 import dataclasses
 
+from actors.network import WeightsSnapshot
 from tests.benchmarks.contest import Finding, Heat, Lap, compete
 from tests.benchmarks.ray_service import ray_service
 from tests.checkpointing import Silent
 
 
-class Watcher(Silent):
-    """Tells the lap of the service's own evaluations, which go on beside the training and count in its time."""
-
-    def __init__(self, lap: Lap, score: str) -> None:
-        self.lap = lap
-        self.score = score
-
-    def row(self, row):
-        if self.score in row.metrics:
-            self.lap.judged(row.metrics[self.score])
-
-
 def train(heat: Heat) -> Finding:
-    config = dataclasses.replace(heat.config, envs_per_worker=heat.envs)
-    if heat.threshold is None:
-        config = dataclasses.replace(config, eval_every_env_steps=10**9)
+    config = dataclasses.replace(heat.config, envs_per_worker=heat.envs, eval_every_env_steps=10**9)
     with ray_service(config) as make_loop:
         lap = Lap(heat)
-        watcher = Watcher(lap, "eval/success_rate" if config.env.is_swarm else "eval/return")
-        loop = make_loop(watcher, lambda: lap.over(loop.env_steps, loop.updates))
+
+        def weights() -> WeightsSnapshot:
+            loop.settle()  # or workers and learner would go on while the watch stands still
+            return loop.newest_weights()
+
+        loop = make_loop(Silent(), lambda: lap.over(loop.env_steps, loop.updates, weights))
         loop.run()
         return lap.finding()
 
