@@ -24,13 +24,13 @@ def checkpoint_of(learner, folder):
 def saved(tmp_path, small_run):
     """A checkpoint of a learner, and the weights that it published."""
     learner = process_cluster(small_run, 0).learner
-    return checkpoint_of(learner, tmp_path), learner.weights()[0].value
+    return checkpoint_of(learner, tmp_path), learner.weights()
 
 
 def test_a_dueling_policy_is_kept_as_the_plain_network_that_it_equals(tmp_path, small_run):
     config = dataclasses.replace(small_run, network="dueling", hidden_sizes=(9, 8))
     shape, learner = env_shape(config.env), process_cluster(config, 0).learner
-    weights = learner.weights()[0].value
+    weights = learner.weights()
     save_policy(tmp_path / "policy.safetensors", weights, config, shape)
     again = read_saved_policy(tmp_path / "policy.safetensors", config, shape)
     checkpoint = checkpoint_of(learner, tmp_path)
