@@ -14,6 +14,7 @@ from safetensors.numpy import load_file
 
 from learner.checkpoint import newest_valid
 from learner.config import flat_params, to_dict
+from learner.ray_edge import COLLECTS_IN_FLIGHT, PUSHES_IN_FLIGHT
 from tests.integration.conftest import SMALL, flags
 from tests.integration.jobs import Job
 
@@ -90,7 +91,8 @@ def test_every_transition_is_accounted_for(shoal, tmp_path, replay):
     assert all(shard["inserted"] > 0 and shard["dropped"] == 0 for shard in shards)
     assert state["pacing"]["sampled"] == state["updates"] * config.batch_size
     ahead = state["pacing"]["inserted"] * config.samples_per_insert - state["pacing"]["sampled"]
-    band = 2 * config.batch_size * config.updates_per_call + 6 * config.block_env_steps * config.samples_per_insert
+    blocks = config.workers * (COLLECTS_IN_FLIGHT + PUSHES_IN_FLIGHT)
+    band = 2 * config.batch_size * config.updates_per_call + blocks * config.block_env_steps * config.samples_per_insert
     assert 0 <= ahead - config.min_replay * config.samples_per_insert <= band
     if replay == "prioritised":
         assert_priorities_came_back(checkpoint.folder, shards)
