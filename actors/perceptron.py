@@ -48,7 +48,7 @@ def forward(layers: Layers, room: tuple[Floats, ...]) -> None:
 
 @inlined
 def _shift(x: Floats, bias: Floats, rectify: bool) -> None:
-    """X + bias in place, or max(x + bias, 0), where NaN stays NaN."""
+    """Adds the bias in place; if it rectifies, what is below 0 becomes 0, and NaN stays NaN."""
     zero = np.float32(0)
     for row in range(x.shape[0]):
         for column in range(x.shape[1]):

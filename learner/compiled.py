@@ -93,14 +93,13 @@ class CompiledUpdates:
         )
         seen, other = (make_room(self._size, self._layers) for _ in range(2))
         self._room = _Room(seen, other, *np.zeros((2, self._size), np.float32))
-        self._compile(settings.observation_size)
+        self._compile()
 
-    def _compile(self, width: int) -> None:
+    def _compile(self) -> None:
         """Compiles for this number of layers, or loads what was compiled, before anybody waits for an update."""
-        states, column = np.zeros((0, width), np.float32), np.zeros(0, np.float32)
+        states, column = np.zeros((0, 0), np.float32), np.zeros(0, np.float32)
         rows = _Rows(states, np.zeros(0, np.int64), column, column, states, column)
-        values, empty = self._online.values.detach().numpy(), np.zeros(0, np.float32)
-        self._run(rows, _Flat(values, empty, empty, empty, empty), 0.0, 0, 0.0, empty)
+        self._run(rows, _Flat(column, column, column, column, column), 0.0, 0, 0.0, column)
 
     def _run(self, rows: _Rows, flat: _Flat, learning_rate: float, updates: int, steps: float, errors: Floats) -> Any:
         sums = np.zeros(3)
@@ -121,7 +120,7 @@ class CompiledUpdates:
         )
         gradient = self._online.values.grad
         assert gradient is not None
-        tensors = (self._online.values.detach(), gradient, state["exp_avg"], state["exp_avg_sq"], self._target.values)
+        tensors = (self._online.values, gradient, state["exp_avg"], state["exp_avg_sq"], self._target.values)
         errors = np.empty(len(rows.a_tm1), np.float32)
         flat = _Flat(*(tensor.detach().numpy() for tensor in tensors))
         count = len(errors) // self._size
@@ -206,14 +205,14 @@ def _losses(rows: _Rows, start: int, room: _Room, huber: bool, errors: Floats, s
     for row in range(size):
         error = room.goal[row] - q_tm1[row, rows.a_tm1[start + row]]
         weight = rows.weight[start + row]
-        clipped = error
         if huber:
-            clipped = one if error > one else (-one if error < -one else error)
-            loss += weight * (clipped * (error - half * clipped))
-            room.slope[row] = -weight * clipped / np.float32(size)
+            slope = one if error > one else (-one if error < -one else error)
+            lost = slope * (error - half * slope)
         else:
-            loss += weight * (error * error)
-            room.slope[row] = -weight * (two * error) / np.float32(size)
+            slope = two * error
+            lost = error * error
+        loss += weight * lost
+        room.slope[row] = -weight * slope / np.float32(size)
         size_of_error += abs(error)
         errors[start + row] = error
         for action in range(q_tm1.shape[1]):

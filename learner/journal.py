@@ -17,10 +17,17 @@ ACCOUNT = "account/"
 """Begins the names of counts since the start of the run."""
 FINAL = "final/"
 """Begins the names of a run's results."""
-_FOR_MONITORING = {
-    *("replay/size", "policy/staleness_s", "train/td_error", "train/episode_length", "eval/episode_length"),
-    *("time/worker_acts", "time/learner_updates", "time/learner_publishes", "system/cpu_utilization_percentage"),
-}
+_FOR_MONITORING = (
+    "replay/size",
+    "policy/staleness_s",
+    "train/td_error",
+    "train/episode_length",
+    "eval/episode_length",
+    "time/worker_acts",
+    "time/learner_updates",
+    "time/learner_publishes",
+    "system/cpu_utilization_percentage",
+)
 _WITH_INTERVAL = ("final/success_rate", "final/return")
 _ENDS = ("_low", "_high")
 

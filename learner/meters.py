@@ -7,14 +7,11 @@ from typing import Any
 
 import psutil
 
-from actors.transitions import NO_OUTCOME, BlockReport
-from learner.node import UpdateReport
+from actors.transitions import ACTS, NO_OUTCOME, STORES, WAITS, BlockReport
+from learner.node import PUBLISHES, SAMPLES, UPDATES, UpdateReport
 from sim_core.outcomes import Outcome
 
-HOPS = {
-    "worker": ("worker_acts", "worker_stores", "worker_waits"),
-    "learner": ("learner_updates", "learner_samples", "learner_publishes", "learner_waits"),
-}
+HOPS = {"worker": (ACTS, STORES, WAITS), "learner": (UPDATES, SAMPLES, PUBLISHES, WAITS)}
 """What a part's time goes to; the shares of all rollout workers together, and of the learner, sum to 1."""
 
 
@@ -59,7 +56,6 @@ class Meters:
 
     def _take_seconds(self, part: str, seconds: dict[str, float]) -> None:
         self._add(**{f"{part}_{what}": value for what, value in seconds.items()})
-        self._add(**{f"{part}_seconds": sum(seconds.values())})
 
     def row(self, replay_size: int, samples_per_insert: float) -> dict[str, float]:
         """The metrics since the last row; starts the next."""
@@ -70,15 +66,21 @@ class Meters:
         metrics |= self._means("train/", "calls", {"loss": "loss", "q_mean": "q_mean", "td_error": "td_error"})
         staleness = {"staleness_updates": "staleness_updates", "staleness_s": "staleness_s"}
         metrics |= self._means("policy/", "blocks", staleness)
-        for part, hops in HOPS.items():
-            metrics |= self._means("time/", f"{part}_seconds", {hop: hop for hop in hops})
-        metrics |= self._speeds()
+        metrics |= self._shares() | self._speeds()
         self._sums = {}
         return metrics
 
     def _means(self, prefix: str, count: str, names: dict[str, str]) -> dict[str, float]:
         total = self._sums.get(count, 0.0)
-        return {prefix + key: self._sums.get(name, 0.0) / total for key, name in names.items()} if total else {}
+        return {prefix + key: self._sums[name] / total for key, name in names.items()} if total else {}
+
+    def _shares(self) -> dict[str, float]:
+        shares: dict[str, float] = {}
+        for part, hops in HOPS.items():
+            seconds = {f"time/{part}_{hop}": self._sums.get(f"{part}_{hop}", 0.0) for hop in hops}
+            total = sum(seconds.values())
+            shares |= {name: value / total for name, value in seconds.items()} if total else {}
+        return shares
 
     def _speeds(self) -> dict[str, float]:
         now_s = time.perf_counter()

@@ -129,8 +129,8 @@ REPLAY = (
 
 
 def _share(part: str, does: str, meaning: str, healthy: str) -> Exported:
-    text = f"of the {part}'s time: {meaning}"
-    return _gauge(f"time/{part.split()[-1]}_{does}", f"time_{part.split()[-1]}_{does}", "share", text, healthy)
+    name = f"{part.split()[-1]}_{does}"
+    return _gauge(f"time/{name}", f"time_{name}", "share", f"of the {part}'s time: {meaning}", healthy)
 
 
 _LIMITS = "high where it limits the run"

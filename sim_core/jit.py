@@ -56,11 +56,11 @@ def kernel(function: Any) -> Any:
     return _compiled(function)
 
 
-def inlined(function: Any) -> Any:
+def inlined(function: Any, **options: Any) -> Any:
     """Compiles `function` as a part of the kernels that call it, each of which takes it in whole."""
-    return _compiled(function, forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    return _compiled(function, forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
 
 
 def product(function: Any) -> Any:
     """Compiles `function` as `inlined` does, but with numba's run-time: `np.dot`, numba's way to BLAS, needs it."""
-    return _compiled(function, forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=True)
+    return inlined(function, _nrt=True)
