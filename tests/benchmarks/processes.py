@@ -1,5 +1,8 @@
 """The processes of a training over Ray, by what they do."""
 
+from collections.abc import Callable, Sequence
+
+import numpy as np
 import psutil
 
 from deploy.chaos_processes import TITLES
@@ -16,16 +19,21 @@ def kind_of(process: psutil.Process) -> str:
     return next((name for name in ("raylet", "gcs_server") if name in words[0]), "other process of Ray")
 
 
-def cpu_seconds() -> dict[str, float]:
-    """CPU time that this process, the driver, and its children have spent so far, by kind."""
+def by_kind(look: Callable[[psutil.Process], Sequence[float]]) -> dict[str, np.ndarray]:
+    """What `look` sees of this process, the driver, and of its children, summed over the processes of each kind."""
     driver = psutil.Process()
-    spent: dict[str, float] = {}
+    sums: dict[str, np.ndarray] = {}
     for process in [driver, *driver.children(recursive=True)]:
         try:
             with process.oneshot():
                 kind = "driver" if process == driver else kind_of(process)
-                times = process.cpu_times()
+                seen = np.array(look(process), float)
         except psutil.NoSuchProcess:
             continue
-        spent[kind] = spent.get(kind, 0.0) + times.user + times.system
-    return spent
+        sums[kind] = sums.get(kind, 0.0) + seen
+    return sums
+
+
+def cpu_seconds() -> dict[str, float]:
+    """CPU time spent so far, by kind of process."""
+    return {kind: float(times.sum()) for kind, times in by_kind(lambda process: process.cpu_times()[:2]).items()}

@@ -1,9 +1,7 @@
 """How the service scales: what each hop costs, what a model makes of that, and what the service really does."""
 
 import dataclasses
-import time
 from pathlib import Path
-from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -17,8 +15,7 @@ from learner.cluster import learner_settings
 from learner.config import RunConfig
 from learner.learner import Learner
 from tests.benchmarks.hop_costs import measured_costs
-from tests.benchmarks.processes import cpu_seconds
-from tests.benchmarks.ray_service import ray_service
+from tests.benchmarks.ray_service import ENDLESS, Point, measured_point
 from tests.benchmarks.service_model import (
     LEARNER,
     SHARDS,
@@ -31,60 +28,11 @@ from tests.benchmarks.service_model import (
     saturation,
     seconds_per_env_step,
 )
-from tests.checkpointing import Silent
 
 POINTS = ((1, 2.0), (2, 2.0), (4, 2.0), (8, 2.0), (1, 0.25), (2, 0.25), (1, 8.0), (2, 8.0))
 """Rollout workers and samples per insert that are measured."""
-WARM_S, COUNTED_S = 3.0, 10.0
+COUNTED_S = 10.0
 PICTURE = Path(__file__).parents[2] / "dashboards" / "images" / "service-model.png"
-
-
-class Point(NamedTuple):
-    """What the service did: rates, CPU seconds per env step by process, and shares of waiting."""
-
-    env_steps_per_s: float
-    updates_per_s: float
-    cpu_s: dict[str, float]
-    waits: dict[str, float]
-
-
-class LastRow(Silent):
-    """Keeps the newest row of metrics."""
-
-    def __init__(self) -> None:
-        self.metrics: dict[str, float] = {}
-
-    def row(self, row):
-        self.metrics |= row.metrics
-
-
-def measured_point(config: RunConfig) -> Point:
-    """The service over Ray in its steady state."""
-    marks: list[tuple[float, int, int, dict[str, float]]] = []
-    observer = LastRow()
-    with ray_service(config) as make_loop:
-        begun_s: list[float] = []
-
-        def mark() -> None:
-            marks.append((time.perf_counter(), loop.env_steps, loop.updates, cpu_seconds()))
-
-        def stop() -> bool:
-            now_s = time.perf_counter()
-            if not begun_s and loop.updates:
-                begun_s.append(now_s)
-            elif begun_s and not marks and now_s - begun_s[0] > WARM_S:
-                mark()
-            elif marks and now_s - marks[0][0] > COUNTED_S:
-                mark()
-                return True
-            return False
-
-        loop = make_loop(observer, stop)
-        loop.run()
-    (start_s, first, first_updates, before), (end_s, last, updates, after) = marks
-    spent = {kind: (after[kind] - before.get(kind, 0.0)) / (last - first) for kind in after}
-    waits = {name: observer.metrics[f"time/{name}"] for name in ("worker_stores", "worker_waits", "learner_waits")}
-    return Point((last - first) / (end_s - start_s), (updates - first_updates) / (end_s - start_s), spent, waits)
 
 
 def microseconds(value: float) -> str:
@@ -195,14 +143,13 @@ def work_of(config: RunConfig) -> Work:
 
 
 def main() -> None:
-    never = {"total_env_steps": 10**9, "eval_every_env_steps": 10**9, "checkpoint_every_env_steps": 10**9}
-    config = RunConfig(**never)
+    config = RunConfig(**ENDLESS)
     work, cores = work_of(config), psutil.cpu_count() or 1
     costs = measured_costs(config)
     points = {}
     for workers, samples in POINTS:
         points[workers, samples] = measured_point(
-            dataclasses.replace(config, workers=workers, samples_per_insert=samples)
+            dataclasses.replace(config, workers=workers, samples_per_insert=samples), COUNTED_S
         )
     console = Console(width=200)
     for table in (cost_table(costs, work), point_table(points, costs, work, cores), saturation_table(costs, work)):

@@ -7,7 +7,6 @@ import signal
 import sys
 import threading
 import time
-from collections import defaultdict
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +20,7 @@ from rich.table import Table  # noqa: E402
 from scipy import stats  # noqa: E402
 
 from deploy.cli import main as shoal  # noqa: E402
-from tests.benchmarks.processes import kind_of  # noqa: E402
+from tests.benchmarks.processes import by_kind  # noqa: E402
 
 FOREVER = 10**12
 """Env steps that no soak comes to."""
@@ -49,20 +48,14 @@ class Usage(NamedTuple):
 
 def usage(time_s: float) -> list[Usage]:
     """All kinds of processes of this run, this one (the driver) included."""
-    driver = psutil.Process()
-    sums: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(4))
-    for process in [driver, *driver.children(recursive=True)]:
-        try:
-            with process.oneshot():
-                kind = "driver" if process == driver else kind_of(process)
-                own = process.memory_full_info().uss / 1e6
-                sums[kind] += (1, own, process.num_fds(), process.num_threads())
-        except psutil.NoSuchProcess:
-            continue
     return [
         Usage(time_s, kind, int(count), float(own), int(handles), int(threads))
-        for kind, (count, own, handles, threads) in sums.items()
+        for kind, (count, own, handles, threads) in by_kind(_held).items()
     ]
+
+
+def _held(process: psutil.Process) -> tuple[float, ...]:
+    return 1, process.memory_full_info().uss / 1e6, process.num_fds(), process.num_threads()
 
 
 def references() -> tuple[int, int]:
