@@ -28,6 +28,7 @@ from tests.benchmarks.service_model import (
     saturation,
     seconds_per_env_step,
 )
+from tests.benchmarks.several_learners import learners_table, sum_seconds, update_seconds
 
 POINTS = ((1, 2.0), (2, 2.0), (4, 2.0), (8, 2.0), (1, 0.25), (2, 0.25), (1, 8.0), (2, 8.0))
 """Rollout workers and samples per insert that are measured."""
@@ -154,6 +155,8 @@ def main() -> None:
     console = Console(width=200)
     for table in (cost_table(costs, work), point_table(points, costs, work, cores), saturation_table(costs, work)):
         console.print(table)
+    floats = work.weights_bytes // np.dtype(np.float32).itemsize
+    console.print(learners_table(costs, work, update_seconds(config), sum_seconds(floats)))
     learner = seconds_per_env_step(costs, work, False)[LEARNER]
     console.print(
         f"{work.row_bytes} bytes a transition, {work.weights_bytes:,} a copy of the weights; the learner's "

@@ -83,6 +83,17 @@ def saturation(costs: Costs, work: Work, own_shards: bool) -> dict[str, float]:
     return {hop: seconds[WORKERS] / spent for hop, spent in seconds.items() if hop != WORKERS}
 
 
+def of_several_learners(costs: Costs, work: Work, learners: int, update_s: float, sum_s: float) -> float:
+    """Env steps a second that learners allow who share every batch.
+
+    Each draws its part from shards in its own process and updates in `update_s`; then all sum their gradients around a
+    ring, which takes two of them `sum_s`.
+    """
+    rows, blocks, calls = work.samples_per_insert, 1 / work.block_env_steps, work.calls_per_env_step
+    together = rows / work.batch_size * (update_s + (learners - 1) * sum_s) + calls * (costs.do + costs.publish)
+    return 1 / (together + (blocks * costs.store + rows * costs.draw) / learners)
+
+
 def network_bytes(work: Work, own_shards: bool) -> float:
     """Bytes between processes per env step: blocks, weights in their replies, samples of shards in other processes."""
     samples = work.samples_per_insert if own_shards else 0.0

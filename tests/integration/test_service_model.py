@@ -13,6 +13,7 @@ from tests.benchmarks.service_model import (
     bounds,
     messages,
     network_bytes,
+    of_several_learners,
     saturation,
     seconds_per_env_step,
 )
@@ -61,6 +62,19 @@ def test_the_tightest_bound_comes_first():
     assert bounds(cheap, WORK, 50, cores=2)[0] == (CORES, pytest.approx(2 / 1.1, rel=1e-6))
     stored = FREE._replace(env_step=1.0, store=1000.0, ask=1e-6)
     assert [bounds(stored, WORK, 30, shards)[0].env_steps_per_s for shards in (1, 2)] == pytest.approx([0.1, 0.2])
+
+
+def test_one_of_several_learners_is_the_learner():
+    costs = Costs(*[float(i + 1) for i in range(len(Costs._fields))])
+    alone = of_several_learners(costs, WORK, 1, costs.update, 1e9)
+    assert 1 / alone == pytest.approx(seconds_per_env_step(costs, WORK, False)[LEARNER])
+
+
+def test_several_learners_share_the_rows_and_pay_for_every_step_of_the_ring():
+    costs = FREE._replace(store=100.0, draw=3.0, publish=7.0)
+    seconds = 1 / of_several_learners(costs, WORK, 4, update_s=10.0, sum_s=5.0)
+    calls, updates = 1 / 100, 2 / 50
+    assert seconds == pytest.approx((1.0 + 2 * 3.0) / 4 + calls * 7.0 + updates * (10.0 + 3 * 5.0))
 
 
 def test_bytes_and_messages():
