@@ -1,7 +1,7 @@
 """The Q-network: in torch, and compiled where it acts.
 
-A rollout worker's batches are small, where a compiled kernel is several times faster than torch and needs no torch
-in the worker's process; both compute the same function (tested).
+A rollout worker's batches are small, where a compiled kernel is several times faster than torch; both compute the same
+function (tested).
 """
 
 from __future__ import annotations

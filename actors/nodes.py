@@ -240,7 +240,10 @@ class RolloutNode:
 
     def settle(self) -> list[BlockReport]:
         """Waits for every push under way; returns their reports."""
-        return self._confirm(0)
+        self._watch.lap(WAITS)
+        reports = self._confirm(0)
+        self._watch.lap(STORES)
+        return reports
 
     def _confirm(self, limit: int) -> list[BlockReport]:
         reports = []

@@ -32,7 +32,7 @@ def multiply(a: Floats, b: Floats, out: Floats) -> None:
 
 
 @product
-def square(x: Floats) -> Any:
+def squared_norm(x: Floats) -> Any:
     """The scalar product of x with itself."""
     return np.dot(x, x)
 

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from actors.perceptron import Floats, Layers, best_of, forward, make_room, multiply, square
+from actors.perceptron import Floats, Layers, best_of, forward, make_room, multiply, squared_norm
 from learner.gradients import FlatNetwork
 from learner.updates import LearnerSettings, UpdateStats
 from sim_core.jit import inlined, kernel
@@ -241,15 +241,16 @@ def _head_gradients(actions: NDArray[np.int64], start: int, online: Layers, slop
     """The last layer's gradients, and the derivatives by its inputs."""
     last = len(online.weights) - 1
     weight, weight_slope, bias_slope = online.weights[last], slopes.weights[last], slopes.biases[last]
-    inputs, delta, zero = room.seen[last], room.other[last], np.float32(0)
-    weight_slope[:] = zero
-    bias_slope[:] = zero
+    inputs, delta = room.seen[last], room.other[last]
+    weight_slope[:] = np.float32(0)
+    bias_slope[:] = np.float32(0)
     for row in range(inputs.shape[0]):
         slope, action = room.slope[row], actions[start + row]
         bias_slope[action] += slope
         for column in range(inputs.shape[1]):
             weight_slope[action, column] += slope * inputs[row, column]
-            delta[row, column] = zero if inputs[row, column] <= zero else slope * weight[action, column]
+            delta[row, column] = slope * weight[action, column]
+    _stop_where_idle(delta, inputs)
 
 
 @inlined
@@ -274,7 +275,7 @@ def _add_up(delta: Floats, total: Floats) -> None:
 def _adam(flat: _Flat, rule: _Rule, learning_rate: float, steps: float) -> None:
     """Scales the gradients down to `max_norm`, as PyTorch does, and makes Adam's step of them."""
     one = np.float32(1)
-    norm = np.sqrt(square(flat.slopes))
+    norm = np.sqrt(squared_norm(flat.slopes))
     scale = np.float32(rule.max_norm) / (norm + np.float32(1e-6))
     scale = one if scale > one else scale
     share_mean, share_square = np.float32(1 - rule.beta_mean), np.float32(1 - rule.beta_square)

@@ -26,6 +26,7 @@ _FOR_MONITORING = (
     "time/worker_acts",
     "time/learner_updates",
     "time/learner_publishes",
+    "time/learner_stores",
     "system/cpu_utilization_percentage",
 )
 _WITH_INTERVAL = ("final/success_rate", "final/return")

@@ -38,9 +38,10 @@ class Learner:
         self._target = self._online.copy()
         self.online, self.target = self._online.network, self._target.network
         self.optimiser = torch.optim.Adam([self._online.values], fused=True)
-        plain = settings.gradients == "by_hand" and settings.network == "plain" and self.device.type == "cpu"
-        ways = CompiledUpdates if plain else TorchUpdates
-        self._make: Updates = ways(self._online, self._target, self.optimiser, settings)
+        by_hand = settings.gradients == "by_hand"
+        compilable = by_hand and settings.network == "plain" and self.device.type == "cpu"
+        kind = CompiledUpdates if compilable else TorchUpdates
+        self._updates_of: Updates = kind(self._online, self._target, self.optimiser, settings)
         self.updates = 0
         self._batch_size = settings.batch_size
         self._columns = Columns()
@@ -59,7 +60,7 @@ class Learner:
         columns = self._columns(rows)
         if weights is not None:
             columns["weight"] = torch.from_numpy(weights)
-        stats, self.td_errors = self._make(columns, learning_rate, self.updates)
+        stats, self.td_errors = self._updates_of(columns, learning_rate, self.updates)
         self.updates += len(rows) // self._batch_size
         return stats
 

@@ -131,7 +131,7 @@ class TrainingLoop:
         return self.env_steps >= self._config.total_env_steps
 
     def _send_first_weights(self) -> None:
-        weights = self.newest_weights()
+        weights = self.newest_weights()  # here, so that a learner that is gone is not a worker's fault
         for worker in self._mender.workers:
             try:
                 self._mender.ask(worker, "set_weights", weights)
@@ -166,7 +166,7 @@ class TrainingLoop:
 
     def _start_evaluation(self) -> None:
         seeds = list(range(EVAL_SEED, EVAL_SEED + self._config.eval_episodes))
-        ref = self._calls.run(evaluate, self._config.env, self._mender.newest_weights(), seeds)
+        ref = self._calls.run(evaluate, self._config.env, self._mender.weights_ref(), seeds)
         self._under_way.add(ref, Pending("eval", EVALUATOR, self._mender.incarnation(EVALUATOR), self.env_steps))
 
     def _start(self, part: Part, method: str, amount: int, *args: Any) -> None:

@@ -118,7 +118,7 @@ class Mender:
         self._under_way.heard(part)
         return answer
 
-    def newest_weights(self) -> Ref:
+    def weights_ref(self) -> Ref:
         """A reference to the learner's weights, which may not be there yet."""
         return self._cluster.calls.start(self._cluster.learner, "weights")
 
@@ -215,7 +215,7 @@ class Mender:
         for target in targets:
             if target in self._incarnations:
                 self._tell(index, target)
-        cluster.calls.start(worker, "set_weights", self.newest_weights())
+        cluster.calls.start(worker, "set_weights", self.weights_ref())
         return unreported
 
     def _restart_shard(self, part: Part) -> Delivered:

@@ -11,7 +11,7 @@ from actors.transitions import ACTS, NO_OUTCOME, STORES, WAITS, BlockReport
 from learner.node import PUBLISHES, SAMPLES, UPDATES, UpdateReport
 from sim_core.outcomes import Outcome
 
-HOPS = {"worker": (ACTS, STORES, WAITS), "learner": (UPDATES, SAMPLES, PUBLISHES, WAITS)}
+HOPS = {"worker": (ACTS, STORES, WAITS), "learner": (UPDATES, SAMPLES, PUBLISHES, STORES, WAITS)}
 """What a part's time goes to; the shares of all rollout workers together, and of the learner, sum to 1."""
 
 

@@ -134,14 +134,26 @@ def _share(part: str, does: str, meaning: str, healthy: str) -> Exported:
 
 
 _LIMITS = "high where it limits the run"
+_WAITS = "waiting for the training loop, and for checkpoints"
 TIMES = (
     _share("rollout worker", "acts", "stepping environments", _LIMITS),
     _share("rollout worker", "stores", "waiting for a shard's reply to a push", "small"),
-    _share("rollout worker", "waits", "waiting for the training loop", "high where the learner limits the run"),
+    _share(
+        "rollout worker",
+        "waits",
+        _WAITS,
+        "high where the learner limits the run",
+    ),
     _share("learner", "updates", "making updates", _LIMITS),
     _share("learner", "samples", "drawing transitions, or waiting for shards", "small"),
     _share("learner", "publishes", "handing out weights and TD errors", "small"),
-    _share("learner", "waits", "waiting for the training loop", "high where the rollout workers limit the run"),
+    _share("learner", "stores", "storing the rollout workers' blocks, where the shards are its own", "small"),
+    _share(
+        "learner",
+        "waits",
+        _WAITS,
+        "high where the rollout workers limit the run",
+    ),
 )
 
 # Ray shows a counter once it counts: what should stay 0 is a gauge.

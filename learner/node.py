@@ -18,7 +18,7 @@ from actors.network import WeightsSnapshot
 from actors.nodes import ShardNode
 from actors.parts import PartWriter, Written, join_written
 from actors.stopwatch import Stopwatch
-from actors.transitions import WAITS, AddReply, Delivered, Draws, SampleReply, TransitionBlock
+from actors.transitions import STORES, WAITS, AddReply, Delivered, Draws, SampleReply, TransitionBlock
 from learner.double_dqn import importance_weights
 from learner.learner import Learner
 from learner.updates import LearnerSettings, UpdateStats
@@ -33,7 +33,7 @@ WEIGHTS = "learner.safetensors"
 class UpdateReport(NamedTuple):
     """What a call of updates gives back: their means, and the version reached.
 
-    `seconds` says where the learner's time went since its last report (see SAMPLES, UPDATES, PUBLISHES, WAITS).
+    `seconds` says where the learner's time went since its last report (see SAMPLES, UPDATES, PUBLISHES, STORES, WAITS).
     """
 
     stats: UpdateStats
@@ -78,8 +78,11 @@ class LearnerNode:
 
     def add(self, block: TransitionBlock) -> AddReply:
         """Stores a block in an embedded shard, each in turn."""
+        self._watch.lap(WAITS)
         shard: ShardNode = self._shards[block.header.sequence % len(self._shards)]
-        return shard.add(block)
+        reply = shard.add(block)
+        self._watch.lap(STORES)
+        return reply
 
     def fence(self, worker_id: int, closed: int, incarnation: int) -> Delivered:
         """Fences a worker in all embedded shards (see `ShardNode.fence`); returns what they hold together."""

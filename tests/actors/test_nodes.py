@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from actors.calls import Done, LocalCalls
+from actors import nodes as nodes_module
+from actors.calls import LocalCalls
 from actors.faults import CallFailed, Fault
 from actors.nodes import RolloutNode, ShardNode, ShardSettings
 from actors.rollout import RolloutSettings, RolloutWorker
+from actors.stopwatch import Stopwatch
 from actors.transitions import Delivered, Dropped, transition_dtype
 from actors.vector_env import env_shape
 from tests.checkpointing import saved
@@ -29,8 +31,6 @@ class DeferredCalls(LocalCalls):
         return Later(node, method, args)
 
     def get(self, ref):
-        if isinstance(ref, Done):
-            return ref.value
         if not ref.done:
             node, method, args = ref.call
             ref.value, ref.done = getattr(node, method)(*args), True
@@ -67,6 +67,35 @@ def test_blocks_go_to_the_shards_in_turn(make_node, make_shard):
         assert [report.stored for report in node.collect(0.5)] == [BLOCK]
         sizes.append([shard.size() // BLOCK for shard in shards])
     assert sizes == [[0, 1, 0], [0, 1, 1], [1, 1, 1], [1, 2, 1]]
+
+
+def test_all_of_a_workers_time_counts_for_what_it_does(make_node, make_shard, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(nodes_module, "Stopwatch", lambda: Stopwatch(lambda: now[0]))
+
+    class SlowCalls(DeferredCalls):
+        def get(self, ref):
+            now[0] += 0 if ref.done else 4.0
+            return super().get(ref)
+
+    node = make_node([make_shard()], SlowCalls(), pushes_in_flight=1)
+    steps = node._worker.collect
+
+    def slow_steps(rate):
+        now[0] += 1.0
+        return steps(rate)
+
+    monkeypatch.setattr(node._worker, "collect", slow_steps)
+    assert node.collect(0.5) == []
+    now[0] += 16.0
+    (report,) = node.collect(0.5)
+    assert report.seconds == {"acts": 2.0, "waits": 16.0, "stores": 4.0}
+    now[0] += 32.0
+    node.settle()
+    now[0] += 64.0
+    assert node.collect(0.5) == []
+    (report,) = node.collect(0.5)
+    assert report.seconds == {"acts": 2.0, "waits": 96.0, "stores": 8.0}
 
 
 def test_what_is_stored_is_what_the_worker_collected(make_node, make_shard, settings, swarm, make_weights):
@@ -191,8 +220,6 @@ class Unreliable(LocalCalls):
         return (fault, result)
 
     def get(self, ref):
-        if isinstance(ref, Done):
-            return ref.value
         fault, result = ref
         if fault is not None:
             raise CallFailed(fault, "simulated")

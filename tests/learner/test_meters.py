@@ -52,6 +52,7 @@ def test_a_row_holds_means_over_episodes_blocks_and_calls():
         "time/learner_updates": 7 / 8,
         "time/learner_samples": 0.5 / 8,
         "time/learner_publishes": 0.0,
+        "time/learner_stores": 0.0,
         "time/learner_waits": 0.5 / 8,
     }
     assert expected.items() <= row.items()

@@ -11,7 +11,9 @@ from actors.network import Policy, WeightsSnapshot
 from actors.nodes import ShardNode, ShardSettings
 from actors.prioritised import SMALLEST, PrioritySettings
 from actors.rollout import join_stats
+from actors.stopwatch import Stopwatch
 from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock
+from learner import node as node_module
 from learner.double_dqn import importance_weights
 from learner.learner import Learner
 from learner.node import LearnerNode
@@ -35,6 +37,40 @@ def make_learner(learner_settings, make_rows):
         return LearnerNode(learner_settings._replace(**other), shards, calls or LocalCalls()), shards
 
     return make
+
+
+def test_all_of_the_learners_time_counts_for_what_it_does(make_learner, make_rows, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(node_module, "Stopwatch", lambda: Stopwatch(lambda: now[0]))
+    learner, shards = make_learner()
+
+    def lasts(owner, method, seconds):
+        """Every call of this method takes so many seconds."""
+        before = getattr(owner, method)
+
+        def call(*args):
+            now[0] += seconds
+            return before(*args)
+
+        monkeypatch.setattr(owner, method, call)
+
+    for owner, method, seconds in (
+        (shards[0], "add", 1.0),
+        (shards[0], "sample", 2.0),
+        (learner._learner, "update", 4.0),
+        (shards[0], "publish", 8.0),
+    ):
+        lasts(owner, method, seconds)
+    learner.add(make_block(make_rows(30)))
+    now[0] += 16.0
+    first = learner.update(1, RATE).seconds
+    now[0] += 32.0
+    learner.add(make_block(make_rows(30), sequence=1))
+    now[0] += 64.0
+    second = learner.update(1, RATE).seconds
+    once = {"samples": 2.0, "updates": 4.0, "publishes": 8.0, "stores": 1.0}
+    assert first == once | {"waits": 16.0}
+    assert second == once | {"waits": 96.0}
 
 
 class ShardContract:

@@ -16,6 +16,8 @@ import sim_core
 from sim_core import jit
 from sim_core.jit import inlined, kernel
 
+ROOT = Path(sim_core.__file__).parents[1]
+
 START = """
 import numba
 before = numba.config.CACHE_DIR
@@ -56,7 +58,7 @@ def change(source, pattern, value):
 
 
 def test_kernels_follow_changes_of_any_source(tmp_path):
-    shutil.copytree(Path(sim_core.__file__).parent, tmp_path / "sim_core", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "sim_core", tmp_path / "sim_core", ignore=shutil.ignore_patterns("__pycache__"))
     first = start(tmp_path)
     compiled = kept(tmp_path)
     assert compiled and start(tmp_path) == first and kept(tmp_path) == compiled  # nothing compiled anew
@@ -66,6 +68,18 @@ def test_kernels_follow_changes_of_any_source(tmp_path):
     assert first[1] and second[1]
     both = kept(tmp_path)
     assert compiled.items() < both.items() and len(both) == 2 * len(compiled)
+
+
+def test_kernels_follow_changes_of_the_neighbours_that_have_kernels(tmp_path):
+    for package in ("sim_core", *jit.NEIGHBOURS):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    start(tmp_path)
+    for name, follows in (("actors/perceptron.py", True), ("learner/compiled.py", True), ("actors/calls.py", False)):
+        before = len(list((tmp_path / "cache").iterdir()))
+        with (tmp_path / name).open("a") as source:
+            source.write("# changed\n")
+        start(tmp_path)
+        assert len(list((tmp_path / "cache").iterdir())) == before + follows
 
 
 def test_other_users_of_numba_keep_their_setting(monkeypatch):
@@ -79,7 +93,7 @@ def test_other_users_of_numba_keep_their_setting(monkeypatch):
 
 
 def test_kernels_are_kept_beside_the_sources_or_in_the_users_cache(monkeypatch, tmp_path):
-    package = Path(sim_core.__file__).parent
+    package = ROOT / "sim_core"
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     monkeypatch.setattr(jit.os, "access", lambda path, mode: True)
     assert Path(jit._cache_folder()).parent == package / "__pycache__"
