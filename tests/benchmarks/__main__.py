@@ -22,6 +22,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--rvo2", type=Path, action="append", default=[], metavar="PATH", help="a built rvo2_driver; may be repeated"
     )
+    parser.add_argument("--picture", action="store_true", help="`scaling` draws the README's picture of the model anew")
     options = parser.parse_args(arguments)
     for name in options.names:
         if name not in BENCHMARKS:
@@ -38,6 +39,8 @@ def main() -> int:
     for name in options.names or BENCHMARKS:
         if name == "simulator":
             simulator.main(options.sections, [path.resolve() for path in options.rvo2])
+        elif name == "scaling":
+            importlib.import_module("tests.benchmarks.scaling").main(options.picture)
         else:  # imported here, as their libraries take seconds that the simulator's processes need not wait
             importlib.import_module(f"tests.benchmarks.{name}").main()
     return 0

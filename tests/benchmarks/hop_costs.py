@@ -48,6 +48,10 @@ class Hop:
         self._shard.add(block._replace(header=header))
         return self._weights
 
+    def receive(self, weights: WeightsSnapshot) -> None:
+        """Takes weights."""
+        self._weights = weights
+
     def give(self, count: int) -> np.ndarray:
         """Rows that are drawn here."""
         return self._shard.sample(count).rows
@@ -77,6 +81,8 @@ def measured_costs(config: RunConfig) -> Costs:
         ask, do = cpu_of_calls(hop, lambda: ray.get(hop.nothing.remote()))
         push, store = cpu_of_calls(hop, lambda: ray.get(hop.store.remote(block)))
         take, give = cpu_of_calls(hop, lambda: ray.get(hop.give.remote(rows)))
+        weights = learner.weights(0.0)
+        send, receive = cpu_of_calls(hop, lambda: ray.get(hop.receive.remote(weights)))
         publish, _ = cpu_of_calls(hop, lambda: learner.weights(0.0))
     finally:
         ray.shutdown()
@@ -91,6 +97,8 @@ def measured_costs(config: RunConfig) -> Costs:
         give=max(0.0, give - do) / rows,
         take=max(0.0, take - ask) / rows,
         publish=publish,
+        send=send,
+        receive=receive,
     )
 
 

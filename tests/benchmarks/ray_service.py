@@ -1,5 +1,7 @@
 """The whole service over Ray, for benchmarks that watch its training loop."""
 
+import math
+import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -44,20 +46,25 @@ class Point(NamedTuple):
     waits: dict[str, float]
 
 
-class LastRow(Silent):
-    """Keeps the newest row of metrics."""
+class Rows(Silent):
+    """Keeps rows of metrics."""
 
     def __init__(self) -> None:
-        self.metrics: dict[str, float] = {}
+        self.rows: list[dict[str, float]] = []
 
     def row(self, row):
-        self.metrics |= row.metrics
+        self.rows.append(row.metrics)
+
+    def mean(self, name: str) -> float:
+        """Over the rows that have it; NaN where none has."""
+        found = [metrics[name] for metrics in self.rows if name in metrics]
+        return statistics.fmean(found) if found else math.nan
 
 
 def measured_point(config: RunConfig, seconds: float) -> Point:
     """The service over Ray in its steady state, looked at for so many seconds."""
     marks: list[tuple[float, int, int, dict[str, float]]] = []
-    observer = LastRow()
+    observer = Rows()
     with ray_service(config) as make_loop:
         begun_s: list[float] = []
 
@@ -69,6 +76,7 @@ def measured_point(config: RunConfig, seconds: float) -> Point:
             if not begun_s and loop.updates:
                 begun_s.append(now_s)
             elif begun_s and not marks and now_s - begun_s[0] > WARM_S:
+                observer.rows.clear()
                 mark()
             elif marks and now_s - marks[0][0] > seconds:
                 mark()
@@ -79,5 +87,5 @@ def measured_point(config: RunConfig, seconds: float) -> Point:
         loop.run()
     (start_s, first, first_updates, before), (end_s, last, updates, after) = marks
     spent = {kind: (after[kind] - before.get(kind, 0.0)) / (last - first) for kind in after}
-    waits = {name: observer.metrics[f"time/{name}"] for name in ("worker_stores", "worker_waits", "learner_waits")}
+    waits = {name: observer.mean(f"time/{name}") for name in ("worker_stores", "worker_waits", "learner_waits")}
     return Point((last - first) / (end_s - start_s), (updates - first_updates) / (end_s - start_s), spent, waits)

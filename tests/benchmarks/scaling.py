@@ -18,8 +18,7 @@ from tests.benchmarks.hop_costs import measured_costs
 from tests.benchmarks.ray_service import ENDLESS, Point, measured_point
 from tests.benchmarks.service_model import (
     LEARNER,
-    SHARDS,
-    WORKERS,
+    MANY,
     Costs,
     Work,
     bounds,
@@ -27,6 +26,7 @@ from tests.benchmarks.service_model import (
     network_bytes,
     saturation,
     seconds_per_env_step,
+    shards_needed,
 )
 from tests.benchmarks.several_learners import learners_table, sum_seconds, update_seconds
 
@@ -55,6 +55,8 @@ def cost_table(costs: Costs, work: Work) -> Table:
         "store": "the same, who stores",
         "give": "a row drawn in another process, there",
         "take": "the same, at the learner",
+        "send": "a copy of the weights for a shard in a process of its own, who sends",
+        "receive": "a copy of the weights for a shard in a process of its own, who gets it",
         "publish": "new weights, at the learner",
     }
     for name, text in what.items():
@@ -93,19 +95,17 @@ def saturation_table(costs: Costs, work: Work) -> Table:
     for samples in sorted({samples for _, samples in POINTS}):
         here = work._replace(samples_per_insert=samples)
         for own in (False, True):
-            seconds = seconds_per_env_step(costs, here, own)
-            others = {hop: spent for hop, spent in seconds.items() if hop not in (WORKERS, SHARDS)}
-            full = max(others, key=lambda hop: others[hop])
-            rate = 1 / others[full]
-            shards = max(1, int(np.ceil(seconds[SHARDS] * rate))) if own else 0
+            shards = shards_needed(costs, here) if own else 0
+            full, rate = bounds(costs, here, MANY, shards)[0]
+            workers = saturation(costs, here, shards)[full]
             table.add_row(
                 f"{samples:g}",
                 f"{shards} of their own" if own else "with the learner",
                 full,
                 f"{rate:,.0f}",
-                f"{saturation(costs, here, own)[full]:.1f}",
+                f"{workers:.1f}",
                 f"{messages(here, shards) * rate:,.0f}",
-                f"{network_bytes(here, own) * rate / 1e6:,.0f}",
+                f"{network_bytes(here, workers, shards) * rate / 1e6:,.0f}",
             )
     return table
 
@@ -143,7 +143,7 @@ def work_of(config: RunConfig) -> Work:
     return Work(config.block_env_steps, config.samples_per_insert, *sizes, row, weights)
 
 
-def main() -> None:
+def main(picture: bool) -> None:
     config = RunConfig(**ENDLESS)
     work, cores = work_of(config), psutil.cpu_count() or 1
     costs = measured_costs(config)
@@ -157,11 +157,12 @@ def main() -> None:
         console.print(table)
     floats = work.weights_bytes // np.dtype(np.float32).itemsize
     console.print(learners_table(costs, work, update_seconds(config), sum_seconds(floats)))
-    learner = seconds_per_env_step(costs, work, False)[LEARNER]
+    learner = seconds_per_env_step(costs, work, 0)[LEARNER]
     console.print(
         f"{work.row_bytes} bytes a transition, {work.weights_bytes:,} a copy of the weights; the learner's "
         f"{microseconds(learner)} µs per env step are {work.samples_per_insert:g} samples",
         highlight=False,
     )
-    draw(points, costs, work, cores)
-    console.print(f"drawn: {PICTURE}", highlight=False)
+    if picture:
+        draw(points, costs, work, cores)
+        console.print(f"drawn: {PICTURE}", highlight=False)

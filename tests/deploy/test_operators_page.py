@@ -38,21 +38,23 @@ def table(heading: str) -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def model():
-    """(from the simulator's table to a rollout worker here, env steps/s that one learner takes up), from the README."""
+    """From the README: env steps/s of a rollout worker, of the bare simulator on its table's machine, of a full learner."""
     (full,) = re.findall(r"full first, at\s+([\d,]+) env steps/s with 2 samples", MEASURED)
     assert f"{benchmark('bare learner, batch 256', 3):,.0f} updates/s at batch 256" in PAGE
-    (machines,) = re.findall(r"and ([\d.]+), this machine against that one", PAGE)
-    return benchmark("rollout worker, one core", 4) * number(machines), number(full)
+    (worker,) = re.findall(r"^\| 1 \| 0.25 \| ([\d,]+) \|", MEASURED, re.MULTILINE)
+    (simulator,) = re.findall(r"the bare simulator made ([\d,]+)\.", MEASURED)
+    assert f"times {worker} / {simulator}," in PAGE
+    return number(worker), number(simulator), number(full)
 
 
 def test_workers_of_a_learner_follow_from_the_benchmarks(model):
-    ratio, taken_up = model
+    worker, simulator, taken_up = model
     assert f"full at\n{taken_up:,.0f} env steps/s with 2 samples" in PAGE
     for setup, rate, workers, cpus in table("setup"):
         if setup == "10r×2g":
-            expected = benchmark("rollout worker, one core", 2)
+            expected = worker
         else:
-            expected = benchmark(f" {setup} ", 5) * ratio
+            expected = benchmark(f" {setup} ", 5) * worker / simulator
         stated = number(re.search(r"([\d,]+)(?: \(measured\))?$", rate)[1])
         assert stated == pytest.approx(expected, rel=0.03)
         assert int(workers) == math.ceil(taken_up / stated)

@@ -16,6 +16,7 @@ from tests.benchmarks.service_model import (
     of_several_learners,
     saturation,
     seconds_per_env_step,
+    shards_needed,
 )
 
 FREE = Costs(*[0.0] * len(Costs._fields))
@@ -31,26 +32,39 @@ WORK = Work(
 
 def test_a_free_network_leaves_env_steps_and_updates():
     costs = FREE._replace(env_step=3.0, update=200.0)
-    assert seconds_per_env_step(costs, WORK, False) == {
+    assert seconds_per_env_step(costs, WORK, 0) == {
         WORKERS: 3.0,
         LEARNER: 8.0,
         DRIVER: 0.0,
     }  # 2 samples, 50 a batch
-    assert saturation(costs._replace(ask=1e-9), WORK, False)[LEARNER] == pytest.approx(3 / 8)
+    assert saturation(costs._replace(ask=1e-9), WORK, 0)[LEARNER] == pytest.approx(3 / 8)
 
 
 def test_calls_and_blocks_are_shared_by_their_env_steps():
     costs = FREE._replace(do=1.0, push=10.0, store=1000.0, publish=1e4, ask=1e5)
     calls = 1 / 100  # of updates: 4 x 50 samples are 100 env steps' share
-    assert seconds_per_env_step(costs, WORK, False) == pytest.approx(
+    assert seconds_per_env_step(costs, WORK, 0) == pytest.approx(
         {WORKERS: 0.11, LEARNER: calls * 10_001 + 10.0, DRIVER: (1 / 100 + calls) * 1e5}
     )
 
 
 def test_shards_of_their_own_take_over_storing_and_drawing():
     costs = FREE._replace(store=100.0, give=5.0, take=7.0, draw=1e9)
-    apart = seconds_per_env_step(costs, WORK, True)
+    apart = seconds_per_env_step(costs, WORK, 1)
     assert apart[SHARDS] == pytest.approx(1.0 + 10.0) and apart[LEARNER] == pytest.approx(14.0)
+
+
+def test_every_shard_of_its_own_is_asked_and_told():
+    calls, costs = 1 / 100, FREE._replace(ask=1.0, do=10.0, send=100.0, receive=1000.0)
+    apart = seconds_per_env_step(costs, WORK, 3)
+    assert apart[LEARNER] == pytest.approx(calls * (10.0 + 3 * 101.0))
+    assert apart[SHARDS] == pytest.approx(calls * 3 * 1010.0)
+
+
+def test_shards_are_enough_once_something_else_is_full():
+    costs = FREE._replace(env_step=1e-9, ask=1e-9, update=50.0, give=7.0)  # learner: 2 s an env step, shards: 14
+    assert shards_needed(costs, WORK) == 7
+    assert shards_needed(costs._replace(give=7.1), WORK) == 8
 
 
 def test_the_tightest_bound_comes_first():
@@ -67,7 +81,7 @@ def test_the_tightest_bound_comes_first():
 def test_one_of_several_learners_is_the_learner():
     costs = Costs(*[float(i + 1) for i in range(len(Costs._fields))])
     alone = of_several_learners(costs, WORK, 1, costs.update, 1e9)
-    assert 1 / alone == pytest.approx(seconds_per_env_step(costs, WORK, False)[LEARNER])
+    assert 1 / alone == pytest.approx(seconds_per_env_step(costs, WORK, 0)[LEARNER])
 
 
 def test_several_learners_share_the_rows_and_pay_for_every_step_of_the_ring():
@@ -78,7 +92,10 @@ def test_several_learners_share_the_rows_and_pay_for_every_step_of_the_ring():
 
 
 def test_bytes_and_messages():
-    assert network_bytes(WORK, False) == 40 + 30
-    assert network_bytes(WORK, True) == 3 * 40 + 30
+    versions = 1 / 100  # as many as blocks
+    assert network_bytes(WORK, 9, 0) == 40 + versions * 3_000
+    assert network_bytes(WORK, 9, 4) == pytest.approx(3 * 40 + 5 * versions * 3_000)
+    seldom = WORK._replace(samples_per_insert=0.2)
+    assert network_bytes(seldom, 3, 0) == pytest.approx(40 + 0.3 * versions * 3_000)
     assert messages(WORK, 0) == pytest.approx(2 / 100 + 1 / 100)
     assert messages(WORK, 3) == pytest.approx(2 / 100 + 7 / 100)
