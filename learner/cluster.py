@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from actors.calls import Calls, LocalCalls, Node
-from actors.nodes import RolloutNode, ShardNode, ShardSettings
 from actors.prioritised import PrioritySettings
 from actors.rollout import RolloutSettings
+from actors.rollout_node import RolloutNode
+from actors.shard_node import ShardNode, ShardSettings
 from actors.transitions import transition_dtype
 from actors.vector_env import EnvShape, env_shape
 from learner.config import RunConfig

@@ -9,9 +9,9 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from actors.evaluator import evaluate, evaluate_in_parts
+from actors.evaluator import evaluate
 from actors.exploration import epsilon
-from actors.faults import CallFailed, Part, PartFailed, PartKind, Recovery, RunFailed
+from actors.faults import CallFailed, Part, PartFailed, PartKind, Recovery
 from actors.locations import Location
 from actors.network import WeightsSnapshot
 from actors.transitions import BlockReport, EpisodeStats
@@ -286,16 +286,6 @@ class TrainingLoop:
         except RunLost as lost:
             return lost
         return RunLost(failure, self._mender.highest)
-
-    def final_evaluation(self, weights: WeightsSnapshot) -> EpisodeStats:
-        """Plays `weights` over `final_eval_episodes`, in parallel tasks that need none of the run's parts."""
-        first = self._config.final_eval_first_seed
-        seeds = list(range(first, first + self._config.final_eval_episodes))
-        shared = self._calls.put(weights)
-        try:
-            return evaluate_in_parts(self._calls, self._config.env, shared, seeds, self._cluster.eval_tasks)
-        except CallFailed as failure:
-            raise RunFailed(f"the evaluation at the end {failure.fault} again and again: {failure.reason}") from failure
 
     def newest_weights(self) -> WeightsSnapshot:
         """The weights that the last update made.

@@ -15,8 +15,8 @@ from actors.calls import Calls, Node, Ref
 from actors.faults import CallFailed, Part, PartFailed, PartKind
 from actors.locations import Location, fetched, inside
 from actors.network import WeightsSnapshot
-from actors.nodes import ShardNode
 from actors.parts import PartWriter, Written, join_written
+from actors.shard_node import ShardNode
 from actors.stopwatch import Stopwatch
 from actors.transitions import STORES, WAITS, AddReply, Delivered, Draws, SampleReply, TransitionBlock
 from learner.double_dqn import importance_weights

@@ -30,7 +30,8 @@ from ray.exceptions import (
 from actors.calls import LocalCalls, Node, Ref
 from actors.evaluator import Candidate, evaluate_in_parts
 from actors.faults import CallFailed, Fault, PartFailed, first_line
-from actors.nodes import RolloutNode, ShardNode
+from actors.rollout_node import RolloutNode
+from actors.shard_node import ShardNode
 from actors.transitions import EpisodeStats
 from actors.vector_env import EnvSpec, env_shape
 from learner.cluster import Cluster, learner_settings, rollout_settings, shard_settings

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import closing
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
-from actors.faults import Decision, Mended, PartFailed, Recovery, first_line
+from actors.evaluator import evaluate_in_parts
+from actors.faults import CallFailed, PartFailed, Recovery, RunFailed, first_line
 from actors.locations import Location
 from actors.network import WeightsSnapshot
 from actors.transitions import EpisodeStats
@@ -20,6 +21,7 @@ from learner.journal import Journal, PushedMark, Row
 from learner.loop import TrainingLoop
 from learner.manifest import CheckpointError, UselessCheckpointError
 from learner.mending import RunLost
+from learner.observer import Display, MirroringObserver
 from learner.place import Place
 from learner.ray_edge import ray_cluster
 from learner.ray_metrics import RayMetrics
@@ -36,18 +38,6 @@ MISFITS = (ValueError, TypeError, KeyError, IndexError, AttributeError, Overflow
 """What taking up a state of the wrong shape raises; a checksum cannot tell that it was written to do harm."""
 
 
-class Display(Protocol):
-    """What shows a run to a person."""
-
-    def row(self, row: Row) -> None:
-        """A row of metrics was written."""
-        ...
-
-    def message(self, text: str) -> None:
-        """Something worth a line happened."""
-        ...
-
-
 class RunResult(NamedTuple):
     """How a run ended; `evaluation`, its `episodes` and `weights` are None if a signal stopped it before its end.
 
@@ -61,60 +51,6 @@ class RunResult(NamedTuple):
     evaluation: Evaluation | None
     episodes: EpisodeStats | None
     weights: WeightsSnapshot | None
-
-
-class MirroringObserver:
-    """Passes rows on to the display, to MLflow once a checkpoint covers them, and faults to their log.
-
-    Args:
-      delivery: carries the journal to MLflow.
-      faults: the run's log of faults.
-      display: shows all to a person.
-      monitor: is given every row too.
-      resumed: whether this process goes on with the run of another one.
-    """
-
-    def __init__(
-        self,
-        delivery: Delivery,
-        faults: FaultLog,
-        display: Display,
-        monitor: Callable[[Row], None],
-        resumed: bool,
-    ) -> None:
-        self._delivery = delivery
-        self._faults = faults
-        self._display = display
-        self._monitor = monitor
-        self._resumed = resumed
-
-    def ready(self) -> None:
-        """Logs that the run is where another process left it."""
-        if self._resumed:
-            self._faults.resumed()
-
-    def row(self, row: Row) -> None:
-        """Shows the row."""
-        self._display.row(row)
-        self._monitor(row)
-
-    def checkpoint(self, folder: Location, journal_offset: int) -> None:
-        """Asks for the delivery of the rows that the checkpoint covers."""
-        self._delivery.up_to(journal_offset)
-
-    def checkpoint_failed(self, env_steps: int, reason: str) -> None:
-        """Says so; the next checkpoint is tried as usual."""
-        self._display.message(f"the checkpoint of {env_steps:,} env steps could not be written: {reason}")
-
-    def failed(self, failure: PartFailed, decision: Decision) -> None:
-        """Logs and shows a failure."""
-        self._faults.failed(failure, decision)
-        self._display.message(f"{failure}: {decision.action}")
-
-    def mended(self, mended: Mended) -> None:
-        """Logs and shows that a part works again."""
-        self._faults.mended(mended)
-        self._display.message(f"{mended.part} works again after {mended.seconds:.1f} s")
 
 
 def open_cluster(config: RunConfig, incarnation: int, place: Place) -> Cluster:
@@ -298,7 +234,22 @@ def _attempt(
                 return RunResult(loop.env_steps, loop.updates, loop.saved, stop.signal, None, None, None)
             display.message(f"training done; evaluating {config.final_eval_episodes} greedy episodes")
             weights = loop.newest_weights()
-            episodes = loop.final_evaluation(weights)
+            episodes = final_evaluation(config, cluster, weights)
         except PartFailed as failure:  # outside of the rounds of training
             raise loop.lost(failure) from failure
         return RunResult(loop.env_steps, loop.updates, loop.saved, None, summarise(episodes), episodes, weights)
+
+
+def final_evaluation(config: RunConfig, cluster: Cluster, weights: WeightsSnapshot) -> EpisodeStats:
+    """Plays `weights` over `final_eval_episodes`, in parallel tasks that need none of the run's parts.
+
+    Raises:
+      RunFailed: a task fails again and again.
+    """
+    first = config.final_eval_first_seed
+    seeds = list(range(first, first + config.final_eval_episodes))
+    shared = cluster.calls.put(weights)
+    try:
+        return evaluate_in_parts(cluster.calls, config.env, shared, seeds, cluster.eval_tasks)
+    except CallFailed as failure:
+        raise RunFailed(f"the evaluation at the end {failure.fault} again and again: {failure.reason}") from failure

@@ -52,7 +52,7 @@ class SweepPlace(NamedTuple):
 
 
 class RowDisplay:
-    """Passes a run's rows on; implements `learner.run.Display`.
+    """Passes a run's rows on; implements `learner.observer.Display`.
 
     Args:
       on_row: is called with every row.

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from actors import nodes as nodes_module
+from actors import rollout_node
 from actors.calls import LocalCalls
 from actors.faults import CallFailed, Fault
-from actors.nodes import RolloutNode, ShardNode, ShardSettings
 from actors.rollout import RolloutSettings, RolloutWorker
+from actors.rollout_node import RolloutNode
+from actors.shard_node import ShardNode, ShardSettings
 from actors.stopwatch import Stopwatch
 from actors.transitions import Delivered, Dropped, transition_dtype
 from actors.vector_env import env_shape
@@ -71,7 +72,7 @@ def test_blocks_go_to_the_shards_in_turn(make_node, make_shard):
 
 def test_all_of_a_workers_time_counts_for_what_it_does(make_node, make_shard, monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(nodes_module, "Stopwatch", lambda: Stopwatch(lambda: now[0]))
+    monkeypatch.setattr(rollout_node, "Stopwatch", lambda: Stopwatch(lambda: now[0]))
 
     class SlowCalls(DeferredCalls):
         def get(self, ref):
@@ -140,7 +141,7 @@ def test_a_late_reply_does_not_bring_older_weights_back(make_node, make_shard, s
 
 
 def test_staleness_in_seconds_counts_from_publication(monkeypatch, make_node, make_shard):
-    monkeypatch.setattr("actors.nodes.time.time", lambda: 142.5)
+    monkeypatch.setattr("actors.rollout_node.time.time", lambda: 142.5)
     assert make_node([make_shard()]).collect(0.0)[0].staleness_s == pytest.approx(42.5)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import ray
 
 from actors.network import WeightsSnapshot
-from actors.nodes import make_shard
 from actors.rollout import RolloutWorker
+from actors.shard_node import make_shard
 from actors.transitions import TransitionBlock
 from actors.vector_env import env_shape
 from learner.cluster import learner_settings, rollout_settings, shard_settings

@@ -19,9 +19,9 @@ from gymnasium.spaces import Box, Discrete
 from rich.console import Console
 from rich.table import Table
 
-from actors.nodes import ShardSettings, make_shard
 from actors.prioritised import PrioritySettings
 from actors.rollout import join_stats
+from actors.shard_node import ShardSettings, make_shard
 from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
 from learner.double_dqn import importance_weights
 from learner.learner import Columns

@@ -38,7 +38,7 @@ def table(heading: str) -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def model():
-    """From the README: env steps/s of a rollout worker, of the bare simulator (its table's machine), of a full learner."""
+    """From the README, env steps/s: a rollout worker, the simulator where its table was made, a full learner."""
     (full,) = re.findall(r"full first, at\s+([\d,]+) env steps/s with 2 samples", MEASURED)
     assert f"{benchmark('bare learner, batch 256', 3):,.0f} updates/s at batch 256" in PAGE
     (worker,) = re.findall(r"^\| 1 \| 0.25 \| ([\d,]+) \|", MEASURED, re.MULTILINE)

@@ -7,9 +7,10 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from actors import nodes
+from actors import rollout_node
 from actors.faults import Action, Fault, PartKind, Recovery, RunFailed
-from actors.nodes import RolloutNode, ShardNode
+from actors.rollout_node import RolloutNode
+from actors.shard_node import ShardNode
 from learner import cluster as cluster_module
 from learner.checkpoint import newest_valid
 from learner.checkpointer import Checkpointer
@@ -304,7 +305,7 @@ def test_what_a_part_that_was_given_up_writes_later_is_in_no_checkpoint(run, con
             return "dies before"
         return None
 
-    save_file = nodes.save_file
+    save_file = rollout_node.save_file
     writers = []
 
     def slow_save(arrays, path):
@@ -313,7 +314,7 @@ def test_what_a_part_that_was_given_up_writes_later_is_in_no_checkpoint(run, con
             go_on.wait(60)
         save_file(arrays, path)
 
-    monkeypatch.setattr(nodes, "save_file", slow_save)
+    monkeypatch.setattr(rollout_node, "save_file", slow_save)
     config = dataclasses.replace(config, workers=1)
     loop, _, listener, _ = run(config, fault)
     go_on.set()

@@ -8,9 +8,9 @@ from scipy import stats
 
 from actors.calls import Done, LocalCalls
 from actors.network import Policy, WeightsSnapshot
-from actors.nodes import ShardNode, ShardSettings
 from actors.prioritised import SMALLEST, PrioritySettings
 from actors.rollout import join_stats
+from actors.shard_node import ShardNode, ShardSettings
 from actors.stopwatch import Stopwatch
 from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock
 from learner import node as node_module
