@@ -1,16 +1,21 @@
 """The processes of a training over Ray, by what they do."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 import psutil
 
 from deploy.chaos_processes import TITLES
 
+SPY = "profiler"
+
 
 def kind_of(process: psutil.Process) -> str:
     """What a process of the run's does."""
     words = process.cmdline() or [process.name()]
+    if Path(words[0]).name == "py-spy":
+        return SPY
     for kind, title in TITLES.items():
         if words[0].startswith(title):
             return kind
@@ -19,14 +24,25 @@ def kind_of(process: psutil.Process) -> str:
     return next((name for name in ("raylet", "gcs_server") if name in words[0]), "other process of Ray")
 
 
+def processes_of_the_run() -> Iterator[tuple[str, psutil.Process]]:
+    """This process, the driver, and its children, each with what it does; those that look at others are left out."""
+    driver = psutil.Process()
+    yield "driver", driver
+    for process in driver.children(recursive=True):
+        try:
+            kind = kind_of(process)
+        except psutil.NoSuchProcess:
+            continue
+        if kind != SPY:
+            yield kind, process
+
+
 def by_kind(look: Callable[[psutil.Process], Sequence[float]]) -> dict[str, np.ndarray]:
     """What `look` sees of this process, the driver, and of its children, summed over the processes of each kind."""
-    driver = psutil.Process()
     sums: dict[str, np.ndarray] = {}
-    for process in [driver, *driver.children(recursive=True)]:
+    for kind, process in processes_of_the_run():
         try:
             with process.oneshot():
-                kind = "driver" if process == driver else kind_of(process)
                 seen = np.array(look(process), float)
         except psutil.NoSuchProcess:
             continue

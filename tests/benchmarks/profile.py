@@ -1,0 +1,146 @@
+"""Where the CPU time of a training over Ray goes: py-spy's samples of its processes, sorted by what they are for."""
+
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import psutil
+from rich.console import Console
+from rich.table import Table
+
+from learner.config import RunConfig
+from tests.benchmarks.processes import processes_of_the_run
+from tests.benchmarks.ray_service import ENDLESS, WARM_S, ray_service
+from tests.checkpointing import Silent
+
+SECONDS, RATE_HZ = 30, 100
+SPY = Path(sysconfig.get_path("scripts")) / "py-spy"
+PARTS = ("driver", "rollout worker", "learner")
+RAY = "Ray"
+Samples = dict[int, Counter[str]]
+"""Of each thread, by its id, how often it was seen at what."""
+WORK = (
+    ("simulation", ("sim_core/",)),
+    ("policy", ("actors/network.py", "actors/perceptron.py", "actors/exploration.py")),
+    ("updates", ("learner/compiled.py", "learner/learner.py", "learner/updates.py", "learner/double_dqn.py")),
+    ("replay", ("actors/replay.py", "actors/prioritised.py", "actors/sum_tree.py", "actors/shard_node.py")),
+    ("transitions and blocks", ("actors/rollout.py", "actors/nstep.py", "actors/vector_env.py")),
+    ("training loop", ("learner/", "actors/", "tests/")),
+    (RAY, ("ray/", "<frozen")),
+)
+"""What a sample is for, by the file of its innermost frame that is named here."""
+
+
+def work_of(stack: str) -> str:
+    """What a stack is for: its frames, `function (file:line)` from the outermost in, are joined by `;`."""
+    for frame in reversed(stack.split(";")):
+        path = frame.rpartition("(")[2]
+        for work, files in WORK:
+            if path.startswith(files):
+                return work
+    return RAY  # what Ray's threads run of the standard library
+
+
+def sorted_samples(lines: Iterable[str]) -> Samples:
+    """Samples of each thread by what they are for.
+
+    Args:
+      lines: py-spy's raw format: a stack, its thread first, and how often it was seen.
+    """
+    found: Samples = {}
+    for line in lines:
+        stack, _, count = line.rpartition(" ")
+        thread = int(stack.partition("(")[2].partition(")")[0])
+        found.setdefault(thread, Counter())[work_of(stack)] += int(count)
+    return found
+
+
+def spied(processes: dict[str, psutil.Process], seconds: int) -> dict[str, Samples]:
+    """Samples of processes, looked at together for so many seconds.
+
+    Raises:
+      RuntimeError: one cannot be looked at.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        spies: dict[str, tuple[Path, subprocess.Popen[str]]] = {}
+        for kind, process in processes.items():
+            out = Path(folder) / str(process.pid)
+            order = [SPY, "record", "--nonblocking", "--threads", "-f", "raw", "-o", out, "-r", RATE_HZ, "-d", seconds]
+            text = list(map(str, [*order, "-p", process.pid]))
+            spies[kind] = out, subprocess.Popen(text, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        found = {}
+        for kind, (out, spy) in spies.items():
+            _, trouble = spy.communicate()
+            if spy.returncode or not out.exists():
+                raise RuntimeError(f"py-spy cannot look at the {kind}, as most systems let root alone: {trouble}")
+            found[kind] = sorted_samples(out.read_text("utf-8").splitlines())
+    return found
+
+
+def thread_seconds(process: psutil.Process) -> dict[int, float]:
+    """CPU seconds of each thread so far."""
+    return {thread.id: thread.user_time + thread.system_time for thread in process.threads()}
+
+
+def spent_on(thread_s: dict[int, float], samples: Samples) -> Counter[str]:
+    """CPU seconds of a process by what they were for; threads that no sample shows are Ray's own."""
+    found: Counter[str] = Counter()
+    for thread, spent_s in thread_s.items():
+        seen = samples.get(thread, Counter({RAY: 1}))
+        for work, count in seen.items():
+            found[work] += spent_s * count / seen.total()
+    return found
+
+
+class Spy(threading.Thread):
+    """Looks at the run's processes once it is steady."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.shares: dict[tuple[str, str], float] = {}
+        self.trouble = ""
+
+    def run(self) -> None:
+        time.sleep(WARM_S)
+        processes = dict(processes_of_the_run())
+        looked_at = {kind: processes[kind] for kind in PARTS}
+        before = {kind: thread_seconds(process) for kind, process in processes.items()}
+        try:
+            samples = spied(looked_at, SECONDS)
+        except RuntimeError as error:
+            self.trouble = str(error)
+            return
+        spent: Counter[tuple[str, str]] = Counter()
+        for kind, process in processes.items():
+            after = thread_seconds(process)
+            thread_s = {thread: after[thread] - before[kind].get(thread, 0.0) for thread in after}
+            spent.update({(kind, work): value for work, value in spent_on(thread_s, samples.get(kind, {})).items()})
+        self.shares = {part: value / spent.total() for part, value in spent.most_common()}
+
+
+def main() -> None:
+    spy = Spy()
+    with ray_service(RunConfig(**ENDLESS)) as make_loop:
+
+        def stop() -> bool:
+            if loop.updates and spy.ident is None:
+                spy.start()
+            return spy.ident is not None and not spy.is_alive()
+
+        loop = make_loop(Silent(), stop)
+        loop.run()
+    if spy.trouble:
+        sys.exit(spy.trouble)
+    table = Table(title="CPU time of a training of 10r×2g M_sensor, one rollout worker and learner")
+    for column, justify in (("process", "left"), ("what it does", "left"), ("share", "right")):
+        table.add_column(column, justify=justify)
+    for (kind, work), share in spy.shares.items():
+        if share >= 0.005:
+            table.add_row(kind, work, f"{share:.1%}")
+    Console(width=120).print(table)
