@@ -8,6 +8,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -83,13 +84,18 @@ def spied(processes: dict[str, psutil.Process], seconds: int) -> dict[str, Sampl
     return found
 
 
-def thread_seconds(process: psutil.Process) -> dict[int, float]:
-    """CPU seconds of each thread so far."""
-    return {thread.id: thread.user_time + thread.system_time for thread in process.threads()}
+def thread_seconds() -> dict[str, dict[int, float]]:
+    """CPU seconds so far of each thread of the run, by kind of process."""
+    found: dict[str, dict[int, float]] = {}
+    for kind, process in processes_of_the_run():
+        with suppress(psutil.NoSuchProcess):
+            threads = {thread.id: thread.user_time + thread.system_time for thread in process.threads()}
+            found.setdefault(kind, {}).update(threads)
+    return found
 
 
 def spent_on(thread_s: dict[int, float], samples: Samples) -> Counter[str]:
-    """CPU seconds of a process by what they were for; threads that no sample shows are Ray's own."""
+    """CPU seconds of processes of a kind by what they were for; threads that no sample shows are Ray's own."""
     found: Counter[str] = Counter()
     for thread, spent_s in thread_s.items():
         seen = samples.get(thread, Counter({RAY: 1}))
@@ -108,18 +114,17 @@ class Spy(threading.Thread):
 
     def run(self) -> None:
         time.sleep(WARM_S)
-        processes = dict(processes_of_the_run())
-        looked_at = {kind: processes[kind] for kind in PARTS}
-        before = {kind: thread_seconds(process) for kind, process in processes.items()}
+        processes = {kind: process for kind, process in processes_of_the_run() if kind in PARTS}
+        before = thread_seconds()
         try:
-            samples = spied(looked_at, SECONDS)
+            samples = spied(processes, SECONDS)
         except RuntimeError as error:
             self.trouble = str(error)
             return
         spent: Counter[tuple[str, str]] = Counter()
-        for kind, process in processes.items():
-            after = thread_seconds(process)
-            thread_s = {thread: after[thread] - before[kind].get(thread, 0.0) for thread in after}
+        for kind, after in thread_seconds().items():
+            earlier = before.get(kind, {})
+            thread_s = {thread: after[thread] - earlier.get(thread, 0.0) for thread in after}
             spent.update({(kind, work): value for work, value in spent_on(thread_s, samples.get(kind, {})).items()})
         self.shares = {part: value / spent.total() for part, value in spent.most_common()}
 
