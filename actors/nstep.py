@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sim_core.jit import inlined, kernel
 
 
 class Steps(NamedTuple):
@@ -54,7 +57,6 @@ class NStepAssembler:
 
     def __init__(self, dtype: np.dtype[Any], num_envs: int, n_step: int, discount: float) -> None:
         self._dtype = dtype
-        self._n_step = n_step
         self._powers = discount ** np.arange(n_step + 1)
         self._kept = empty_steps(n_step - 1, num_envs, dtype)
         self._waits = np.zeros((n_step - 1, num_envs), np.bool_)
@@ -64,43 +66,27 @@ class NStepAssembler:
 
         Kept steps that wait are of running episodes, so that every one of them ends in a new step.
         """
-        kept = self._n_step - 1
-        window = Steps(*(np.concatenate(pair) for pair in zip(self._kept, steps, strict=True)))
-        open_steps = np.concatenate([self._waits, np.ones_like(steps.done)])
-        value, span, ended, terminal = self._look_ahead(window, open_steps)
-        whole = np.arange(len(open_steps)) <= len(open_steps) - self._n_step
-        ready = open_steps & (ended | whole[:, None])
-        step, env = np.nonzero(ready)
-        rows = np.zeros(len(step), self._dtype)
-        rows["observation"] = window.observation[step, env]
-        rows["action"] = window.action[step, env]
-        rows["reward"] = value[step, env]
-        rows["discount"] = np.where(terminal[step, env], 0.0, self._powers[span[step, env]])
-        rows["next_observation"] = window.reached[step + span[step, env] - 1, env]
-        newest = slice(len(open_steps) - kept, None)
+        window = self._after_the_kept(steps)
+        total, num_envs = window.done.shape
+        rows = np.zeros(total * num_envs, self._dtype)
+        waits = np.zeros_like(self._waits)
+        memory = rows.view(np.uint8).reshape(len(rows), self._dtype.itemsize)
+        packed = _Rows(rows["reward"], rows["discount"], rows["action"], memory)
+        fields: Any = self._dtype.fields
+        places = fields["observation"][1], fields["next_observation"][1]
+        seen, reached = _as_bytes(window.observation), _as_bytes(window.reached)
+        columns = _Columns(seen, reached, *window[1:3], *window[4:])
+        count = _assemble(columns, self._waits, self._powers, packed, places, waits)
         for mine, array in zip(self._kept, window, strict=True):
-            mine[...] = array[newest]
-        self._waits = open_steps[newest] & ~ready[newest]
+            mine[...] = array[total - len(mine) :]
+        self._waits = waits
         self._kept.done[:] = False  # what waits belongs to running episodes; the rest is of no use any more
-        return rows
+        return rows[:count]
 
-    def _look_ahead(
-        self, window: Steps, open_steps: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Of every open step: its n-step return, the steps in it, whether the episode ends there, and the task."""
-        value, span = np.zeros(open_steps.shape), np.zeros(open_steps.shape, np.int64)
-        ended, terminal = np.zeros_like(open_steps), np.zeros_like(open_steps)
-        running = open_steps.copy()
-        for ahead in range(self._n_step):
-            here = slice(0, max(0, len(open_steps) - ahead))
-            there = slice(ahead, None)
-            value[here] += np.where(running[here], self._powers[ahead] * window.reward[there], 0.0)
-            span[here] += running[here]
-            ends = running[here] & window.done[there]
-            ended[here] |= ends
-            terminal[here] |= ends & window.terminated[there]
-            running[here] &= ~ends
-        return value, span, ended, terminal
+    def _after_the_kept(self, steps: Steps) -> Steps:
+        if not len(self._waits):
+            return steps
+        return Steps(*(np.concatenate(pair) for pair in zip(self._kept, steps, strict=True)))
 
     def clear(self) -> None:
         """Forgets all waiting steps."""
@@ -116,3 +102,79 @@ class NStepAssembler:
         for name in ("observation", "action", "reward"):
             getattr(self._kept, name)[...] = saved[f"kept_{name}"]
         self._waits = saved["waits"].copy()
+
+
+class _Columns(NamedTuple):
+    """Env steps as Steps, observations as bytes `[steps, num_envs, bytes]`, which are the same type of all methods."""
+
+    observation: NDArray[np.uint8]
+    reached: NDArray[np.uint8]
+    action: NDArray[np.int64]
+    reward: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    done: NDArray[np.bool_]
+
+
+class _Rows(NamedTuple):
+    """The fields of packed rows, and the rows as bytes `[rows, bytes]`."""
+
+    reward: NDArray[np.float32]
+    discount: NDArray[np.float32]
+    action: NDArray[np.int32]
+    memory: NDArray[np.uint8]
+
+
+def _as_bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(array).reshape(*array.shape[:2], math.prod(array.shape[2:])).view(np.uint8)
+
+
+@kernel
+def _assemble(
+    steps: _Columns,
+    waited: NDArray[np.bool_],
+    powers: NDArray[np.float64],
+    rows: _Rows,
+    places: tuple[int, int],
+    waits: NDArray[np.bool_],
+) -> int:
+    """Writes the transitions that are complete to `rows`, and to `waits` which of the last steps are not.
+
+    Of the first steps only those that `waited` begin a transition. `powers` are gamma's up to the n-th, `places` the
+    bytes at which a row's observations begin.
+    """
+    total, num_envs = steps.done.shape
+    kept, count = len(waits), 0
+    for step in range(total):
+        for env in range(num_envs):
+            if step < kept and not waited[step, env]:
+                continue
+            value, last, ended = _look_ahead(steps, powers, step, env)
+            if not ended and step >= total - kept:
+                waits[step - (total - kept), env] = True
+                continue
+            rows.reward[count] = value
+            rows.discount[count] = 0.0 if steps.terminated[last, env] and ended else powers[last + 1 - step]
+            rows.action[count] = steps.action[step, env]
+            _copy(steps.observation[step, env], rows.memory[count], places[0])
+            _copy(steps.reached[last, env], rows.memory[count], places[1])
+            count += 1
+    return count
+
+
+@inlined
+def _look_ahead(steps: _Columns, powers: NDArray[np.float64], step: int, env: int) -> tuple[float, int, bool]:
+    """The discounted rewards from a step on, the last step that they count, and whether the episode ended there."""
+    value, last = 0.0, step
+    for ahead in range(min(len(powers) - 1, steps.done.shape[0] - step)):
+        last = step + ahead
+        value += powers[ahead] * steps.reward[last, env]
+        if steps.done[last, env]:
+            return value, last, True
+    return value, last, False
+
+
+@inlined
+def _copy(source: NDArray[np.uint8], row: NDArray[np.uint8], place: int) -> None:
+    target = row[place : place + len(source)]
+    for i in range(len(source)):
+        target[i] = source[i]

@@ -82,7 +82,10 @@ class RolloutWorker:
         count = self._settings.steps_per_block
         steps = empty_steps(count, self._settings.num_envs, self._dtype)
         detours = draw_detours((count, self._settings.num_envs), rate, self._num_actions, self._rng)
-        ended = [self._step(self._policy, detours[i], steps, i) for i in range(count)]
+        shape = steps.done.shape
+        ended = EpisodeStats(np.zeros(shape, np.int8), np.zeros(shape, np.int32), np.zeros(shape))
+        for i in range(count):
+            self._step(self._policy, detours[i], steps, ended, i)
         rows = self._nstep.push(steps)
         self._made += len(rows)
         weights = self._policy.weights
@@ -98,10 +101,10 @@ class RolloutWorker:
             made=self._made,
         )
         self._sequence += 1
-        return TransitionBlock(header, rows, join_stats([stats for stats in ended if stats]))
+        return TransitionBlock(header, rows, _of_those(steps.done, ended))
 
-    def _step(self, policy: Policy, detours: NDArray[np.int64], steps: Steps, i: int) -> EpisodeStats | None:
-        """One step of every environment, written as step i of `steps`; the episodes that it ended, if any."""
+    def _step(self, policy: Policy, detours: NDArray[np.int64], steps: Steps, ended: EpisodeStats, i: int) -> None:
+        """One step of every environment, written as step i of `steps`; what it ended, as step i of `ended`."""
         action = explore(policy.greedy(self._observation), detours)
         observation, reward, terminated, truncated, infos = self._env.step(action)
         done = terminated | truncated
@@ -111,18 +114,11 @@ class RolloutWorker:
         self._observation = observation
         self._length += 1
         self._return += reward
-        return self._end_episodes(done, infos) if done.any() else None
-
-    def _end_episodes(self, done: NDArray[np.bool_], infos: dict[str, Any]) -> EpisodeStats:
-        outcome = infos.get("final_info", {}).get("outcome")
-        stats = EpisodeStats(
-            outcome=np.full(done.sum(), NO_OUTCOME, np.int8) if outcome is None else outcome[done],
-            length_steps=self._length[done],
-            episode_return=self._return[done],
-        )
-        self._length[done] = 0
-        self._return[done] = 0.0
-        return stats
+        if done.any():
+            ended.outcome[i] = infos.get("final_info", {}).get("outcome", NO_OUTCOME)
+            ended.length_steps[i], ended.episode_return[i] = self._length, self._return
+            self._length[done] = 0
+            self._return[done] = 0.0
 
     def get_state(self) -> dict[str, Any]:
         """All that a checkpoint needs: `arrays` by name and `meta` for JSON.
@@ -163,3 +159,8 @@ def join_stats(parts: list[EpisodeStats]) -> EpisodeStats:
         return EpisodeStats(np.zeros(0, np.int8), np.zeros(0, np.int32), np.zeros(0, np.float64))
     columns = zip(*parts, strict=True)
     return EpisodeStats(*(np.concatenate(column) for column in columns))
+
+
+def _of_those(which: NDArray[np.bool_], stats: EpisodeStats) -> EpisodeStats:
+    outcome, length_steps, episode_return = stats
+    return EpisodeStats(outcome[which], length_steps[which], episode_return[which])
