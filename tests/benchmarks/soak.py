@@ -31,6 +31,8 @@ LEFT_S = 30.0
 """What the run started must have ended so long after it."""
 UNDER_WAY = ("references", "objects in the store")
 """Kinds that are no processes: their number goes up and down with what is under way at a look."""
+LAST = 12
+"""Looks at the end in one of which a count that had risen is down again, unless it leaks: gRPC closes what is idle."""
 STORE = "num local plasma objects: "
 """The line of the raylet's own report with the objects in the node's store."""
 
@@ -122,7 +124,8 @@ def row(kind: str, series: list[Usage], quarter_s: float) -> tuple[list[str], bo
             words += [f"{before:,.1f} → {after:,.1f}", f"{slope:+.2f} ({low:+.2f} … {high:+.2f})"]
         else:
             varies = name == "threads" or kind in UNDER_WAY  # gRPC's pools of threads breathe
-            flat &= after - before < 1 or (varies and growth(settled, name)[1] <= 0)
+            given_back = min(getattr(sample, name) for sample in settled[-LAST:]) <= before
+            flat &= after - before < 1 or given_back or (varies and growth(settled, name)[1] <= 0)
             words.append(f"{before:g} → {after:g}")
     return [*words, "yes" if flat else "NO"], flat
 

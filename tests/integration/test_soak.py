@@ -35,6 +35,10 @@ def test_a_pool_of_threads_that_was_larger_for_a_while_is_flat():
     assert is_flat(series("gcs_server", threads=lambda i: 29 + 2 * (i > 3.4 * QUARTER)))
 
 
+def test_a_connection_that_was_open_for_half_an_hour_is_flat():
+    assert is_flat(series(handles=lambda i: 43 + (3 * QUARTER - 1 < i < 4 * QUARTER - 1)))
+
+
 @pytest.mark.parametrize(
     "leak",
     [
