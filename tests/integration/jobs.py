@@ -48,8 +48,8 @@ class Job:
         """SIGKILL for the driver and every process that it started."""
         driver = psutil.Process(self.process.pid)
         family = [driver, *driver.children(recursive=True)]
-        assert len(family) > 3, "Ray runs in processes of its own"
         for process in family:
             process.kill()
         psutil.wait_procs(family, timeout=30)
         self.process.wait(30)
+        assert len(family) > 3, "Ray runs in processes of its own"
