@@ -41,7 +41,7 @@ class RunConfig:
     """Rollout workers."""
     envs_per_worker: int = 64
     """Environments that one rollout worker steps at once."""
-    steps_per_block: int = 32
+    steps_per_block: int = 128
     """Env steps of each environment in one block of transitions."""
     exploration: Literal["schedule", "ladder"] = "schedule"
     """One falling epsilon for all workers, or Ape-X's ladder of constant ones."""
@@ -89,7 +89,7 @@ class RunConfig:
     """Env steps that a transition spans."""
     batch_size: int = 256
     """Transitions per update."""
-    updates_per_call: int = 32
+    updates_per_call: int = 64
     """Updates between two publications of the weights."""
     learning_rate: float = 1e-3
     """Adam's learning rate at the start (the text's lambda)."""

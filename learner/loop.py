@@ -119,8 +119,8 @@ class TrainingLoop:
             self._send_first_weights()
         self._progress.meters.start_clock()
         while self.env_steps < self._config.total_env_steps and not self._stop():
-            if not self._evaluates_before_checkpoint() and self._progress.is_due("eval"):
-                self._start_evaluation()  # after the last round's checkpoint, which would wait for it
+            if not (self._saver.is_wanted and self._evaluates()) and self._progress.is_due("eval"):
+                self._start_evaluation()  # a checkpoint that is wanted waits for one that is under way, not for two
             self._start_collects()  # act, step, store: the workers push to the shards
             self._start_updates()  # sample, update, publish: when the pacer says so
             self._take_results()
@@ -145,11 +145,18 @@ class TrainingLoop:
                 worker_id = part.number
                 if self._under_way.collects[worker_id] >= self._cluster.collects_in_flight:
                     continue
+                if self._all_is_ordered():
+                    return
                 if not self._pacer.may_collect(self._under_way.blocks_in_flight):
                     self._pacer.waited(to_insert=True)
                     return
                 rate = epsilon(config.epsilon_settings, self.env_steps, worker_id, config.workers)
                 self._start(part, "collect", 0, rate)
+
+    def _all_is_ordered(self) -> bool:
+        """Whether the blocks under way make up what is left of the run."""
+        expected = self._under_way.blocks_in_flight * self._config.block_env_steps
+        return self.env_steps + expected >= self._config.total_env_steps
 
     def _start_updates(self) -> None:
         while self._under_way.count("update") < self._cluster.updates_in_flight:
@@ -158,11 +165,9 @@ class TrainingLoop:
                 self._pacer.waited(to_insert=False)
                 return
             self._pacer.sampling(updates)
-            rate, exponent = (
-                self._config.learning_rate_at(self.env_steps),
-                self._config.importance_exponent_at(self.env_steps),
-            )
-            self._start(LEARNER, "update", updates, updates, rate, exponent)
+            now, config = self.env_steps, self._config
+            rates = config.learning_rate_at(now), config.importance_exponent_at(now)
+            self._start(LEARNER, "update", updates, updates, *rates)
 
     def _start_evaluation(self) -> None:
         seeds = list(range(EVAL_SEED, EVAL_SEED + self._config.eval_episodes))
@@ -174,6 +179,8 @@ class TrainingLoop:
         self._under_way.add(ref, Pending(method, part, self._mender.incarnation(part), amount))
 
     def _take_results(self) -> None:
+        if not self._under_way and self._all_is_ordered():
+            return self.settle()  # the workers report their last pushes only when they are asked
         if not self._under_way:
             raise RuntimeError("nothing is under way and pacing lets nothing start")
         ready = self._calls.wait(self._under_way.refs, self._under_way.patience_s())
@@ -242,10 +249,6 @@ class TrainingLoop:
 
     def _evaluates(self) -> bool:
         return self._under_way.count("eval") > 0
-
-    def _evaluates_before_checkpoint(self) -> bool:
-        """Whether a checkpoint waits for an evaluation to end, so that no other may begin."""
-        return self._saver.is_wanted and self._evaluates()
 
     def _tend_checkpoints(self) -> None:
         """Tells of a checkpoint that has ended; begins one that is due, once none and no evaluation is under way."""

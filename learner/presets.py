@@ -36,6 +36,8 @@ _COMMON: dict[str, Any] = {
     "eval_every_env_steps": 250_000,
     "checkpoint_every_env_steps": 250_000,
     "keep_checkpoints": 1,
+    "steps_per_block": 32,
+    "updates_per_call": 32,
 }
 _TRAINING: dict[tuple[PresetName, MethodName], dict[str, Any]] = {
     ("thesis", "sensor"): {"n_step": 1, "samples_per_insert": 1.5},

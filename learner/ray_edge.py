@@ -56,10 +56,15 @@ FAULTS: tuple[tuple[tuple[type[Exception], ...], Fault], ...] = (
     ((GetTimeoutError,), Fault.LATE),
 )
 """What errors of Ray mean; the first match counts."""
-OWN_RAY = {"idle_worker_killing_time_threshold_ms": 24 * 3_600_000, "task_events_report_interval_ms": 0}
+OWN_RAY = {
+    "idle_worker_killing_time_threshold_ms": 24 * 3_600_000,
+    "task_events_report_interval_ms": 0,
+    "max_direct_call_object_size": 2**20,
+}
 """Settings of a Ray of our own. It keeps processes that wait for tasks: evaluations are tasks beside actors that take
-all CPU slots, and Ray would end their process after a second and start the next one from nothing. And it keeps no list
-of the last 100,000 calls, 300 MB that only its dashboard would show, and there is none."""
+all CPU slots, and Ray would end their process after a second and start the next one from nothing. It keeps no list of
+the last 100,000 calls, 300 MB that only its dashboard would show, and there is none. And it sends blocks of up to a
+MiB in the call itself; past its own 100 KiB they would go through the object store, which costs several calls more."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 

@@ -133,14 +133,18 @@ class Cell(NamedTuple):
         return played + (self.config.total_env_steps * (robots + 60.0) if self.policy == LEARNED else 0.0)
 
 
+FIRST_DEFAULTS = {"steps_per_block": 32, "updates_per_call": 32}
+"""Defaults that have changed since the first results were committed, as they were then."""
+
+
 @functools.lru_cache(maxsize=4096)  # a table of results asks for the same ones after every cell
 def cell_hash(config: RunConfig) -> str:
     """Twelve hex digits of all that decides a cell's results; unlike `config_hash`, the training's length counts.
 
-    Only what differs from the defaults goes in, so that results stay known when a later version has more settings.
-    A default that changes would go unseen here; a test holds the presets against the settings of committed results.
+    Only what differs from the first defaults goes in, so that results stay known when a later version has more
+    settings or other defaults. A test holds the presets against the settings of committed results.
     """
-    defaults = to_dict(RunConfig())
+    defaults = to_dict(RunConfig()) | FIRST_DEFAULTS
     world = {name: value for name, value in to_dict(config)["world"].items() if value != defaults["world"][name]}
     run = {name: value for name, value in to_dict(config).items() if value != defaults[name]}
     values = {**run, "world": world}

@@ -66,8 +66,8 @@ def test_values_out_of_range_are_refused(name, values):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"replay_capacity": 2047, "min_replay": 100}, "replay_capacity.*2048 transitions in each of 1"),
-        ({"replay_capacity": 8191, "min_replay": 100, "replay_shards": 4}, "in each of 4"),
+        ({"replay_capacity": 8191, "min_replay": 100}, "replay_capacity.*8192 transitions in each of 1"),
+        ({"replay_capacity": 32_767, "min_replay": 100, "replay_shards": 4}, "in each of 4"),
         ({"replay_capacity": 20_000, "min_replay": 20_001}, "min_replay.*must not exceed"),
         ({"total_env_steps": 20_000, "min_replay": 20_000}, "nothing is learned"),
     ],
@@ -78,7 +78,7 @@ def test_values_that_contradict_each_other_are_refused(settings, words):
 
 
 def test_the_last_values_that_work():
-    RunConfig(replay_capacity=8192, min_replay=8192, replay_shards=4, total_env_steps=8193)
+    RunConfig(replay_capacity=32_768, min_replay=32_768, replay_shards=4, total_env_steps=32_769)
     RunConfig(seed=2**31 - 1, discount=1.0, epsilon_start=0.0, epsilon_end=1, ladder_base=1, ladder_exponent=0)
 
 

@@ -11,13 +11,14 @@ from tests.checkpointing import Silent
 def train(heat: Heat) -> Finding:
     config = dataclasses.replace(heat.config, envs_per_worker=heat.envs, eval_every_env_steps=10**9)
     with ray_service(config) as make_loop:
-        lap = Lap(heat)
 
         def weights() -> WeightsSnapshot:
             loop.settle()  # or workers and learner would go on while the watch stands still
             return loop.newest_weights()
 
         loop = make_loop(Silent(), lambda: lap.over(loop.env_steps, loop.updates, weights))
+        weights()  # all processes answer: environments and Ray are up, as the peers' are when their watch starts
+        lap = Lap(heat)
         loop.run()
         return lap.finding()
 
