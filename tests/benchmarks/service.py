@@ -1,5 +1,7 @@
 """Where the time goes: the bare simulator, the rollout worker, the learner, and the whole service over Ray."""
 
+import dataclasses
+
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -16,6 +18,8 @@ from tests.benchmarks.timing import rates, ratio, spread
 
 ROUNDS = 5
 SERVICE_S = 30.0
+SAMPLES_PER_INSERT = (2.0, 8.0)
+"""With 2 the rollout worker and the learner fill a core each, with 8 the learner alone decides."""
 
 
 def simulator_work(config: RunConfig):
@@ -61,19 +65,20 @@ def main() -> None:
     bare = {"simulator": simulator_work(config), "worker": worker_work(config)}
     found = rates(bare, ROUNDS)
     learner = rates({"learner": learner_work(config)}, ROUNDS)["learner"]
-    service = measured_point(config, SERVICE_S)
-    table = Table(title=f"{config.world.setup} M_sensor, {config.samples_per_insert:g} samples per insert")
+    table = Table(title=f"{config.world.setup} M_sensor")
     for column in ("part", "env steps/s", "updates/s", "of the bare part"):
         table.add_column(column, justify="right")
     table.add_row("bare simulator, one core", spread(found["simulator"]).text(), "", "")
     share = ratio(found["worker"], found["simulator"])
     table.add_row("rollout worker, one core", spread(found["worker"]).text(), "", share.text(2))
     table.add_row(f"bare learner, batch {config.batch_size}, one core", "", spread(learner).text(), "")
-    table.add_row(
-        "service over Ray, 1 worker + learner",
-        f"{service.env_steps_per_s:,.0f}",
-        f"{service.updates_per_s:,.0f}",
-        f"{service.env_steps_per_s / spread(found['simulator']).median:.2f} · "
-        f"{service.updates_per_s / spread(learner).median:.2f}",
-    )
+    for samples in SAMPLES_PER_INSERT:
+        service = measured_point(dataclasses.replace(config, samples_per_insert=samples), SERVICE_S)
+        table.add_row(
+            f"service over Ray, 1 worker + learner, {samples:g} samples per insert",
+            f"{service.env_steps_per_s:,.0f}",
+            f"{service.updates_per_s:,.0f}",
+            f"{service.env_steps_per_s / spread(found['simulator']).median:.2f} · "
+            f"{service.updates_per_s / spread(learner).median:.2f}",
+        )
     Console(width=140).print(table)

@@ -20,7 +20,9 @@ def test_no_block_is_ordered_past_the_end(small_run, tmp_path, workers, blocks):
     block = small_run.block_env_steps
     config = dataclasses.replace(small_run, workers=workers, total_env_steps=int(blocks * block), min_replay=block)
     cluster = process_cluster(config, 0)
-    nodes = [RolloutNode(rollout_settings(config), i, 0, cluster.calls, cluster.targets, PUSHES) for i in range(workers)]
+    nodes = [
+        RolloutNode(rollout_settings(config), i, 0, cluster.calls, cluster.targets, PUSHES) for i in range(workers)
+    ]
     cluster = cluster._replace(workers=nodes, collects_in_flight=2, blocks_in_flight=workers * (2 + PUSHES))
     with closing(Journal(tmp_path / "m.jsonl", 0)) as journal:
         loop = TrainingLoop(config, cluster, journal, tmp_path / "checkpoints", Silent(), bool)
