@@ -141,12 +141,12 @@ class TrainingLoop:
     def _start_collects(self) -> None:
         config = self._config
         for _ in range(self._cluster.collects_in_flight):
+            if self._all_is_ordered():
+                return  # between rounds, so that a resumed run has every worker's turn where it would have been
             for part in self._mender.workers:
                 worker_id = part.number
                 if self._under_way.collects[worker_id] >= self._cluster.collects_in_flight:
                     continue
-                if self._all_is_ordered():
-                    return
                 if not self._pacer.may_collect(self._under_way.blocks_in_flight):
                     self._pacer.waited(to_insert=True)
                     return

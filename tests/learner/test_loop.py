@@ -16,7 +16,7 @@ PUSHES = 2
 
 @pytest.mark.parametrize("workers", [1, 3])
 @pytest.mark.parametrize("blocks", [1.5, 7.0, 20.1])
-def test_no_block_is_ordered_past_the_end(small_run, tmp_path, workers, blocks):
+def test_no_round_of_blocks_is_ordered_past_the_end(small_run, tmp_path, workers, blocks):
     block = small_run.block_env_steps
     config = dataclasses.replace(small_run, workers=workers, total_env_steps=int(blocks * block), min_replay=block)
     cluster = process_cluster(config, 0)
@@ -27,5 +27,5 @@ def test_no_block_is_ordered_past_the_end(small_run, tmp_path, workers, blocks):
     with closing(Journal(tmp_path / "m.jsonl", 0)) as journal:
         loop = TrainingLoop(config, cluster, journal, tmp_path / "checkpoints", Silent(), bool)
         assert loop.run()
-    assert config.total_env_steps <= loop.env_steps < config.total_env_steps + block
+    assert config.total_env_steps <= loop.env_steps < config.total_env_steps + workers * block
     assert loop.saved is not None
