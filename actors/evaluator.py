@@ -131,8 +131,11 @@ class _Worlds:
     def step(self, action: NDArray[np.int64] | None) -> _Step:
         result = self._worlds.step(None if action is None else action[self._episode])
         done = is_done(result.outcome)
-        for kept, new in zip(self._last, (result.observation, result.reward, done, result.outcome), strict=True):
-            kept[self._episode] = new
+        last, episode = self._last, self._episode
+        last.observation[episode] = result.observation
+        last.reward[episode] = result.reward
+        last.ended[episode] = done
+        last.outcome[episode] = result.outcome
         self._over |= done
         if self._over.mean() >= 0.5 and not self._over.all():
             self._leave_ended()

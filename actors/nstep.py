@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +28,10 @@ class Steps(NamedTuple):
     reached: NDArray[Any]
     terminated: NDArray[np.bool_]
     done: NDArray[np.bool_]
+
+
+def _pairs(a: Steps, b: Steps) -> Iterable[tuple[NDArray[Any], NDArray[Any]]]:
+    return zip(a, b, strict=True)
 
 
 def empty_steps(steps: int, num_envs: int, dtype: np.dtype[Any]) -> Steps:
@@ -77,7 +82,7 @@ class NStepAssembler:
         seen, reached = _as_bytes(window.observation), _as_bytes(window.reached)
         columns = _Columns(seen, reached, *window[1:3], *window[4:])
         count = _assemble(columns, self._waits, self._powers, packed, places, waits)
-        for mine, array in zip(self._kept, window, strict=True):
+        for mine, array in _pairs(self._kept, window):
             mine[...] = array[total - len(mine) :]
         self._waits = waits
         self._kept.done[:] = False  # what waits belongs to running episodes; the rest is of no use any more
@@ -86,7 +91,7 @@ class NStepAssembler:
     def _after_the_kept(self, steps: Steps) -> Steps:
         if not len(self._waits):
             return steps
-        return Steps(*(np.concatenate(pair) for pair in zip(self._kept, steps, strict=True)))
+        return Steps(*(np.concatenate(pair) for pair in _pairs(self._kept, steps)))
 
     def clear(self) -> None:
         """Forgets all waiting steps."""
