@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.packing import Packed, as_bytes, copy_bytes
 from sim_core.jit import inlined, kernel
 
 
@@ -35,7 +36,7 @@ def _pairs(a: Steps, b: Steps) -> Iterable[tuple[NDArray[Any], NDArray[Any]]]:
 
 
 def empty_steps(steps: int, num_envs: int, dtype: np.dtype[Any]) -> Steps:
-    """Zeroed Steps for rows of `dtype` (`actors.transitions.transition_dtype`)."""
+    """Zeroed Steps for rows of `dtype`, packed ones or whole ones."""
     observation = dtype["observation"]
     seen = (steps, num_envs, *observation.shape)
     return Steps(
@@ -54,7 +55,7 @@ class NStepAssembler:
     The last `n_step - 1` steps are kept: those that have not seen `n_step` rewards wait for the next block.
 
     Args:
-      dtype: the row (`actors.transitions.transition_dtype`).
+      dtype: the packed row (`actors.packing.packed_dtype`).
       num_envs: number of environments.
       n_step: steps a transition spans.
       discount: gamma.
@@ -66,27 +67,33 @@ class NStepAssembler:
         self._kept = empty_steps(n_step - 1, num_envs, dtype)
         self._waits = np.zeros((n_step - 1, num_envs), np.bool_)
 
-    def push(self, steps: Steps) -> NDArray[Any]:
+    def push(self, steps: Steps) -> Packed:
         """Takes the next env steps and returns the transitions that they complete, oldest first.
 
         Kept steps that wait are of running episodes, so that every one of them ends in a new step.
         """
         window = self._after_the_kept(steps)
-        total, num_envs = window.done.shape
-        rows = np.zeros(total * num_envs, self._dtype)
-        waits = np.zeros_like(self._waits)
-        memory = rows.view(np.uint8).reshape(len(rows), self._dtype.itemsize)
-        packed = _Rows(rows["reward"], rows["discount"], rows["action"], memory)
-        fields: Any = self._dtype.fields
-        places = fields["observation"][1], fields["next_observation"][1]
-        seen, reached = _as_bytes(window.observation), _as_bytes(window.reached)
-        columns = _Columns(seen, reached, *window[1:3], *window[4:])
-        count = _assemble(columns, self._waits, self._powers, packed, places, waits)
+        packed, self._waits = self._complete(window)
         for mine, array in _pairs(self._kept, window):
-            mine[...] = array[total - len(mine) :]
-        self._waits = waits
+            mine[...] = array[len(array) - len(mine) :]
         self._kept.done[:] = False  # what waits belongs to running episodes; the rest is of no use any more
-        return rows[:count]
+        return packed
+
+    def _complete(self, window: Steps) -> tuple[Packed, NDArray[np.bool_]]:
+        """The transitions that are complete; and which of the last steps wait."""
+        shape = window.done.shape
+        rows = np.zeros(window.done.size, self._dtype)
+        frames = np.empty((len(rows), *window.reached.shape[2:]), window.reached.dtype)
+        written = _Rows(
+            rows["reward"], rows["discount"], rows["action"], rows["next_row"], as_bytes(rows), as_bytes(frames)
+        )
+        columns = _Columns(_as_bytes(window.observation), _as_bytes(window.reached), *window[1:3], *window[4:])
+        begun = _Begun(np.full(shape, -1), np.empty(len(rows), np.int64))
+        waits, fields = np.zeros_like(self._waits), self._dtype.fields
+        assert fields is not None
+        count = _assemble(columns, self._waits, self._powers, written, fields["observation"][1], waits, begun)
+        kept = _link(columns, written, begun)
+        return Packed(rows[:count], frames[:kept].copy()), waits
 
     def _after_the_kept(self, steps: Steps) -> Steps:
         if not len(self._waits):
@@ -121,12 +128,21 @@ class _Columns(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """The fields of packed rows, and the rows as bytes `[rows, bytes]`."""
+    """The fields of packed rows; rows and frames as bytes `[rows, bytes]`."""
 
     reward: NDArray[np.float32]
     discount: NDArray[np.float32]
     action: NDArray[np.int32]
+    next_row: NDArray[np.int32]
     memory: NDArray[np.uint8]
+    frames: NDArray[np.uint8]
+
+
+class _Begun(NamedTuple):
+    """Of every env step `[steps, num_envs]` the row that begins with it, -1 for none; of every row its last step."""
+
+    row: NDArray[np.int64]
+    last: NDArray[np.int64]
 
 
 def _as_bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
@@ -139,13 +155,14 @@ def _assemble(
     waited: NDArray[np.bool_],
     powers: NDArray[np.float64],
     rows: _Rows,
-    places: tuple[int, int],
+    place: int,
     waits: NDArray[np.bool_],
+    begun: _Begun,
 ) -> int:
     """Writes the transitions that are complete to `rows`, and to `waits` which of the last steps are not.
 
-    Of the first steps only those that `waited` begin a transition. `powers` are gamma's up to the n-th, `places` the
-    bytes at which a row's observations begin.
+    Of the first steps only those that `waited` begin a transition. `powers` are gamma's up to the n-th, `place` the
+    byte at which a row's observation begins.
     """
     total, num_envs = steps.done.shape
     kept, count = len(waits), 0
@@ -160,9 +177,33 @@ def _assemble(
             rows.reward[count] = value
             rows.discount[count] = 0.0 if steps.terminated[last, env] and ended else powers[last + 1 - step]
             rows.action[count] = steps.action[step, env]
-            _copy(steps.observation[step, env], rows.memory[count], places[0])
-            _copy(steps.reached[last, env], rows.memory[count], places[1])
+            copy_bytes(steps.observation[step, env], rows.memory[count], place)
+            begun.row[step, env] = count
+            begun.last[count] = last
             count += 1
+    return count
+
+
+@kernel
+def _link(steps: _Columns, rows: _Rows, begun: _Begun) -> int:
+    """Writes `next_row`, and the frames that it takes; returns how many these are."""
+    total, num_envs = steps.done.shape
+    count = 0
+    for step in range(total):
+        for env in range(num_envs):
+            row = begun.row[step, env]
+            if row < 0:
+                continue
+            last = begun.last[row]
+            after = -1
+            if last + 1 < total and not steps.done[last, env]:
+                after = begun.row[last + 1, env]
+            if after >= 0:
+                rows.next_row[row] = after - row
+            else:
+                rows.next_row[row] = -count
+                copy_bytes(steps.reached[last, env], rows.frames[count], 0)
+                count += 1
     return count
 
 
@@ -176,10 +217,3 @@ def _look_ahead(steps: _Columns, powers: NDArray[np.float64], step: int, env: in
         if steps.done[last, env]:
             return value, last, True
     return value, last, False
-
-
-@inlined
-def _copy(source: NDArray[np.uint8], row: NDArray[np.uint8], place: int) -> None:
-    target = row[place : place + len(source)]
-    for i in range(len(source)):
-        target[i] = source[i]

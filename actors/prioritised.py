@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.packing import Packed
 from actors.replay import ReplayShard, ShardSnapshot
 from actors.ring_snapshot import RingSnapshot
 from actors.storage import load_rows, save_rows
@@ -40,16 +41,16 @@ class PrioritisedSnapshot(ShardSnapshot):
     """As ShardSnapshot; the priorities lie in a zarr group of their own within that of the rows.
 
     Args:
-      rows: the shard's rows.
-      priorities: a copy of theirs `[size]`.
+      rows, frames: see ShardSnapshot.
+      priorities: a copy of the rows' `[size]`.
     """
 
-    def __init__(self, rows: RingSnapshot, priorities: NDArray[np.float64]) -> None:
-        super().__init__(rows)
+    def __init__(self, rows: RingSnapshot, frames: RingSnapshot, priorities: NDArray[np.float64]) -> None:
+        super().__init__(rows, frames)
         self._priorities = priorities
 
     def save(self, path: Path) -> None:
-        """Writes rows and priorities to `path`, once."""
+        """Writes rows, frames and priorities to `path`, once."""
         super().save(path)
         save_rows(path / PRIORITIES, self._priorities.view(SAVED))
 
@@ -87,10 +88,10 @@ class PrioritisedShard(ReplayShard):
         """Priorities of the rows held, `[size]`, by slot."""
         return self._tree.values[: self._size]
 
-    def _write(self, rows: NDArray[Any]) -> None:
-        super()._write(rows)
+    def _write(self, packed: Packed) -> None:
+        super()._write(packed)
         capacity = len(self._rows)
-        count = min(len(rows), capacity)
+        count = min(len(packed.rows), capacity)
         start = (self._next - count) % capacity
         first = min(count, capacity - start)
         self._tree.fill(start, first, self._largest)
@@ -135,7 +136,7 @@ class PrioritisedShard(ReplayShard):
 
     def snapshot(self) -> PrioritisedSnapshot:
         """As ReplayShard's; priorities are copied at once, for answers to come change them."""
-        return PrioritisedSnapshot(self._ring_snapshot(), self.priorities.copy())
+        return PrioritisedSnapshot(*self._ring_snapshots(), self.priorities.copy())
 
     def load(self, path: Path, state: dict[str, Any]) -> None:
         """As ReplayShard's.

@@ -1,4 +1,4 @@
-"""A replay shard: a preallocated ring of packed transitions with uniform sampling.
+"""A replay shard: a preallocated ring of packed transitions, and the ring of their frames, with uniform sampling.
 
 One plain class for both placements (in the learner's process, or as a Ray actor of its own).
 """
@@ -12,9 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.frame_ring import FrameRing
+from actors.packing import NUMBERS, Packed, as_bytes, count_frames, packed_dtype, renumber, unpack
 from actors.ring_snapshot import RingSnapshot
 from actors.storage import load_rows, save_rows
 from actors.transitions import SCHEMA_VERSION, BlockHeader, SampleReply, TransitionBlock
+
+FRAMES = "frames"
+"""Name of the saved frames' group."""
 
 
 class Stored(NamedTuple):
@@ -28,20 +33,23 @@ class ShardSnapshot:
     """What a shard holds at one moment, for another thread to write while the shard is written on.
 
     Args:
-      rows: its rows.
+      rows: its packed rows.
+      frames: the places of its frames.
     """
 
-    def __init__(self, rows: RingSnapshot) -> None:
-        self.rows = rows
+    def __init__(self, rows: RingSnapshot, frames: RingSnapshot) -> None:
+        self.rows, self.frames = rows, frames
 
     def save(self, path: Path) -> None:
-        """Writes the rows to a zarr group at `path`, once."""
-        with closing(self.rows):
+        """Writes the rows to a zarr group at `path`, once, and the frames to one within it."""
+        with closing(self):
             save_rows(path, self.rows)
+            save_rows(path / FRAMES, self.frames)
 
     def close(self) -> None:
         """Frees what nobody will write."""
         self.rows.close()
+        self.frames.close()
 
 
 class ReplayShard:
@@ -51,14 +59,15 @@ class ReplayShard:
     worker, is dropped and counted.
 
     Args:
-      dtype: the packed row (`actors.transitions.transition_dtype`).
+      dtype: of the transitions that are drawn (`actors.transitions.transition_dtype`).
       capacity: transitions to hold.
       seed: seed of the sampling stream.
     """
 
     def __init__(self, dtype: np.dtype[Any], capacity: int, seed: int) -> None:
-        self._rows = np.zeros(capacity, dtype)
-        self._bytes = self._rows.view(np.uint8).reshape(capacity, dtype.itemsize)
+        self._dtype = dtype
+        self._rows = np.zeros(capacity, packed_dtype(dtype))
+        self._frames = FrameRing(dtype["observation"])
         self._next = 0
         self._size = 0
         self._inserted = 0
@@ -93,18 +102,18 @@ class ReplayShard:
         Raises:
           ValueError: the block has another schema or row layout.
         """
-        header = block.header
-        if header.schema_version != SCHEMA_VERSION or block.rows.dtype != self._rows.dtype:
+        header, count = block.header, block.transitions
+        if header.schema_version != SCHEMA_VERSION or block.packed.rows.dtype != self._rows.dtype:
             raise ValueError(
-                f"block of worker {header.worker_id} has schema {header.schema_version} and rows {block.rows.dtype}, "
-                f"this shard takes schema {SCHEMA_VERSION} and rows {self._rows.dtype}"
+                f"block of worker {header.worker_id} has schema {header.schema_version} and rows "
+                f"{block.packed.rows.dtype}, this shard takes schema {SCHEMA_VERSION} and rows {self._rows.dtype}"
             )
         if not self._is_new(header):
-            self._dropped += len(block.rows)
+            self._dropped += count
             return Stored(0, True)
         self._newest[header.worker_id] = (header.incarnation, header.sequence)
-        self._write(block.rows)
-        return Stored(len(block.rows), False)
+        self._write(block.packed)
+        return Stored(count, False)
 
     def fence(self, worker_id: int, incarnation: int) -> None:
         """Refuses blocks of older starts of a worker from now on."""
@@ -115,18 +124,27 @@ class ReplayShard:
         last = self._newest.get(header.worker_id)
         return last is None or (header.incarnation, header.sequence) > last
 
-    def _write(self, rows: NDArray[Any]) -> None:
+    def _write(self, packed: Packed) -> None:
+        rows, capacity = packed.rows, len(self._rows)
         self._inserted += len(rows)
-        capacity = len(self._rows)
         rows = rows[-capacity:]
-        packed = rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)  # not field by field: half the time
         first = min(len(rows), capacity - self._next)
-        self._snapshot.protect(self._next, self._next + first)
-        self._snapshot.protect(0, len(rows) - first)
-        self._bytes[self._next : self._next + first] = packed[:first]
-        self._bytes[: len(rows) - first] = packed[first:]
+        pieces = ((self._next, rows[:first]), (0, rows[first:]))
+        for start, piece in pieces:
+            self._give_up(start, start + len(piece))
+        passed_over = count_frames(packed.rows[: len(packed.rows) - len(rows)])
+        number = self._frames.push(packed.frames[passed_over:]) - passed_over
+        for start, piece in pieces:
+            stored = self._rows[start : start + len(piece)]
+            as_bytes(stored)[...] = as_bytes(piece)  # not field by field: half the time
+            renumber(stored["next_row"], number)
         self._next = (self._next + len(rows)) % capacity
         self._size = min(self._size + len(rows), capacity)
+
+    def _give_up(self, start: int, stop: int) -> None:
+        """Prepares slots to be overwritten."""
+        self._snapshot.protect(start, stop)
+        self._frames.release(count_frames(self._rows[start : min(stop, self._size)]))
 
     def sample(self, count: int) -> SampleReply:
         """Draws `count` rows uniformly with replacement.
@@ -143,27 +161,27 @@ class ReplayShard:
             raise ValueError("an empty replay shard cannot be sampled")
 
     def _take(self, slots: NDArray[np.int64]) -> NDArray[Any]:
-        taken = np.take(self._bytes, slots, axis=0, mode="clip")
-        return taken.view(self._rows.dtype).reshape(len(slots))
+        return unpack(slots, self._rows, self._frames.frames, self._dtype)
 
     def get_state(self) -> dict[str, Any]:
-        """Counters and random stream, for JSON; the rows are in `snapshot`."""
+        """Counters and random stream, for JSON; rows and frames are in `snapshot`."""
         return {
             "next": self._next,
             "size": self._size,
             "inserted": self._inserted,
             "dropped": self._dropped,
+            "frames": self._frames.get_state(),
             "newest": [[worker, *last] for worker, last in self._newest.items()],
             "rng": self._rng.bit_generator.state,
         }
 
     def snapshot(self) -> ShardSnapshot:
         """What the shard holds now; one taken before may not be written any more."""
-        return ShardSnapshot(self._ring_snapshot())
+        return ShardSnapshot(*self._ring_snapshots())
 
-    def _ring_snapshot(self) -> RingSnapshot:
+    def _ring_snapshots(self) -> tuple[RingSnapshot, RingSnapshot]:
         self._snapshot = RingSnapshot(self._rows, self._size)
-        return self._snapshot
+        return self._snapshot, self._frames.snapshot()
 
     def load(self, path: Path, state: dict[str, Any]) -> None:
         """Takes up the rows of a `snapshot` that were saved at `path`, and the `get_state` of the same moment.
@@ -177,8 +195,20 @@ class ReplayShard:
         capacity = len(self._rows)
         if state["next"] != (len(rows) if len(rows) < capacity else state["next"] % capacity):
             raise ValueError(f"{path} is the ring of a shard with another capacity than {capacity}")
+        self._frames.load(path / FRAMES, state["frames"], at_most=capacity)
+        _check_links(path, np.roll(rows, -state["next"]), self._frames.numbers)
         self._rows[: len(rows)] = rows
         self._next, self._size = state["next"], state["size"]
         self._inserted, self._dropped = state["inserted"], state["dropped"]
         self._newest = {worker: (incarnation, sequence) for worker, incarnation, sequence in state["newest"]}
         self._rng.bit_generator.state = state["rng"]
+
+
+def _check_links(path: Path, rows: NDArray[Any], frames: range) -> None:
+    """Refuses rows, oldest first, that lead to anything but each other and these frames."""
+    next_row = rows["next_row"]
+    to_frame = next_row <= 0
+    numbers = np.arange(frames.start, frames.stop) % NUMBERS
+    beyond = np.arange(len(rows)) + next_row >= len(rows)
+    if beyond[~to_frame].any() or not np.array_equal(-next_row[to_frame], numbers):
+        raise ValueError(f"{path} has rows that lead to observations which it does not hold")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from actors.exploration import draw_detours, explore
 from actors.network import Policy, WeightsSnapshot
 from actors.nstep import NStepAssembler, Steps, empty_steps
+from actors.packing import packed_dtype
 from actors.transitions import (
     NO_OUTCOME,
     SCHEMA_VERSION,
@@ -51,7 +52,7 @@ class RolloutWorker:
         self._env = make_vector_env(settings.env, settings.num_envs)
         shape = spaces_of(self._env)
         self._num_actions = shape.num_actions
-        self._dtype = transition_dtype(shape.observation_space)
+        self._dtype = packed_dtype(transition_dtype(shape.observation_space))
         seeds = np.random.SeedSequence((settings.seed, worker_id, incarnation))
         env_seeds, policy_seed = seeds.spawn(2)
         self._rng = np.random.Generator(np.random.PCG64(policy_seed))
@@ -86,8 +87,8 @@ class RolloutWorker:
         ended = EpisodeStats(np.zeros(shape, np.int8), np.zeros(shape, np.int32), np.zeros(shape))
         for i in range(count):
             self._step(self._policy, detours[i], steps, ended, i)
-        rows = self._nstep.push(steps)
-        self._made += len(rows)
+        packed = self._nstep.push(steps)
+        self._made += len(packed.rows)
         weights = self._policy.weights
         header = BlockHeader(
             schema_version=SCHEMA_VERSION,
@@ -101,7 +102,7 @@ class RolloutWorker:
             made=self._made,
         )
         self._sequence += 1
-        return TransitionBlock(header, rows, _of_those(steps.done, ended))
+        return TransitionBlock(header, packed, _of_those(steps.done, ended))
 
     def _step(self, policy: Policy, detours: NDArray[np.int64], steps: Steps, ended: EpisodeStats, i: int) -> None:
         """One step of every environment, written as step i of `steps`; what it ended, as step i of `ended`."""

@@ -49,7 +49,7 @@ def _report(push: _Push, reply: AddReply, dropped: Dropped | None) -> BlockRepor
         stored=reply.stored,
         staleness_updates=max(0, reply.weights_version - header.policy_version),
         staleness_s=time.time() - header.policy_time_s,
-        rows=len(push.block.rows),
+        rows=push.block.transitions,
         shard=push.shard,
         shard_incarnation=push.incarnation,
         dropped=dropped,
@@ -151,7 +151,7 @@ class RolloutNode:
             if not reply.duplicate:
                 return _report(push, reply, None)
             if push.attempt > 1 and not reply.outdated:  # an attempt before had stored it
-                return _report(push, reply._replace(stored=len(push.block.rows)), None)
+                return _report(push, reply._replace(stored=push.block.transitions), None)
             return _report(push, reply, Dropped.OUTDATED if reply.outdated else Dropped.DUPLICATE)
 
     def _take_weights(self, reply: AddReply) -> None:

@@ -72,7 +72,7 @@ class ShardNode:
         header = block.header
         before = self._delivered_by(header.worker_id, header.incarnation)
         now = Delivered(
-            before.rows + len(block.rows),
+            before.rows + block.transitions,
             before.env_steps + header.env_steps,
             before.episodes + len(block.episodes.outcome),
             max(before.made, header.made),

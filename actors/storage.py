@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from actors.ring_snapshot import RingSnapshot
 
-FORMAT = "shoal-replay-1"
+FORMAT = "shoal-replay-2"
 CHUNK_ROWS = 65_536
 """Rows of a zarr chunk; a multiple of `ring_snapshot.PIECE_ROWS`."""
 MOST_ROWS = 100_000_000

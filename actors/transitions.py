@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.faults import Fault
+from actors.packing import Packed
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 """Version of the block layout; a shard refuses any other."""
 
 NO_OUTCOME = -1
@@ -46,11 +47,16 @@ class BlockHeader(NamedTuple):
 
 
 class TransitionBlock(NamedTuple):
-    """Transitions of a worker, one packed row each (see `transition_dtype`)."""
+    """Transitions of a worker (see `actors.packing.Packed`)."""
 
     header: BlockHeader
-    rows: NDArray[Any]
+    packed: Packed
     episodes: EpisodeStats
+
+    @property
+    def transitions(self) -> int:
+        """How many there are."""
+        return len(self.packed.rows)
 
 
 class AddReply(NamedTuple):
@@ -137,7 +143,7 @@ class SampleReply(NamedTuple):
 
 
 def transition_dtype(observation_space: gym.spaces.Box) -> np.dtype[Any]:
-    """Packed row of one transition: (s_t, a_t, n-step reward, discount_t, s_{t+n}).
+    """Row of one whole transition: (s_t, a_t, n-step reward, discount_t, s_{t+n}).
 
     `discount` is what the value of `next_observation` counts: gamma^n, and 0 where the task ended. A
     timeout keeps its discount: it is no terminal state.

@@ -6,6 +6,7 @@ import itertools
 
 import psutil
 
+from actors.packing import packed_bytes
 from actors.transitions import transition_dtype
 from actors.vector_env import EnvShape, env_shape
 from learner.config import RunConfig
@@ -25,7 +26,9 @@ NETWORK_COPIES = 5
 
 def parts_bytes(config: RunConfig, shape: EnvShape) -> dict[str, int]:
     """Bytes of each part, by the settings that decide its size."""
-    row = transition_dtype(shape.observation_space).itemsize
+    transition = transition_dtype(shape.observation_space)
+    row, packed = transition.itemsize, packed_bytes(transition, config.steps_per_block, config.n_step)
+    priority = PRIORITY_BYTES if config.replay == "prioritised" else 0
     widths = [shape.observation_size, *config.policy_sizes, shape.num_actions]
     weights = sum(inputs * outputs + outputs for inputs, outputs in itertools.pairwise(widths))
     robots = config.world.num_robots if config.env.is_swarm else 1
@@ -37,7 +40,7 @@ def parts_bytes(config: RunConfig, shape: EnvShape) -> dict[str, int]:
         * config.envs_per_worker
         * (config.steps_per_block + config.n_step)
         * row,
-        "replay_capacity": config.replay_capacity * (row + (PRIORITY_BYTES if config.replay == "prioritised" else 0)),
+        "replay_capacity": int(config.replay_capacity * (packed + priority)),
         "batch_size and updates_per_call": 3 * config.batch_size * config.updates_per_call * row,
         "hidden_sizes": 4 * NETWORK_COPIES * weights,
         "eval_episodes and final_eval_episodes": EPISODE_BYTES * max(config.eval_episodes, config.final_eval_episodes),

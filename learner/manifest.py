@@ -15,7 +15,7 @@ from actors.locations import is_plain
 from actors.parts import FileSum
 from sim_core.checks import ConfigError
 
-VERSION = 4
+VERSION = 5
 FORMAT = f"shoal-checkpoint-{VERSION}"
 MANIFEST = "manifest.json"
 STATE = "state.json"

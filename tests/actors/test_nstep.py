@@ -7,9 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from actors.nstep import NStepAssembler, Steps
+from actors.packing import packed_dtype
 from actors.transitions import transition_dtype
+from tests.packed import unpack
 
 DTYPE = transition_dtype(gym.spaces.Box(-1e6, 1e6, (2,), np.float32))
+ROW = packed_dtype(DTYPE)
 RUNS, TERMINATES, TRUNCATES = 0, 1, 2
 DISCOUNT = 0.9
 
@@ -41,7 +44,7 @@ def steps_of(rewards, ends, steps):
 def push_all(assembler, rewards, ends, steps, cuts=()):
     """Pushes env steps in blocks that are cut at `cuts`; all rows in the order they came."""
     parts = np.split(np.array(steps, np.int64), sorted({cut for cut in cuts if 0 < cut < len(steps)}))
-    return np.concatenate([assembler.push(steps_of(rewards, ends, part)) for part in parts])
+    return np.concatenate([unpack(assembler.push(steps_of(rewards, ends, part)), DTYPE) for part in parts])
 
 
 def of_env(rows, env):
@@ -65,7 +68,7 @@ def histories(draw):
 @settings(max_examples=300, deadline=None)
 def test_equals_the_reference_per_environment_and_in_order(history, n_step, cuts):
     rewards, ends = history
-    assembler = NStepAssembler(DTYPE, rewards.shape[1], n_step, DISCOUNT)
+    assembler = NStepAssembler(ROW, rewards.shape[1], n_step, DISCOUNT)
     rows = push_all(assembler, rewards, ends, range(len(rewards)), cuts)
     expected = [reference(rewards[:, env], ends[:, env], n_step) for env in range(rewards.shape[1])]
     assert len(rows) == sum(map(len, expected))
@@ -78,10 +81,10 @@ def test_equals_the_reference_per_environment_and_in_order(history, n_step, cuts
 def test_a_saved_state_goes_on_where_it_was(history, n_step, data):
     rewards, ends = history
     cut = data.draw(st.integers(0, len(rewards)))
-    whole = NStepAssembler(DTYPE, rewards.shape[1], n_step, DISCOUNT)
+    whole = NStepAssembler(ROW, rewards.shape[1], n_step, DISCOUNT)
     push_all(whole, rewards, ends, range(cut))
     saved = whole.get_state()
-    resumed = NStepAssembler(DTYPE, rewards.shape[1], n_step, DISCOUNT)
+    resumed = NStepAssembler(ROW, rewards.shape[1], n_step, DISCOUNT)
     push_all(resumed, rewards + 5, ends, range(min(2, len(rewards))))  # what it held before must not matter
     expected = push_all(whole, rewards, ends, range(cut, len(rewards)))  # must not change what was saved
     resumed.set_state(saved)
@@ -93,7 +96,7 @@ def test_a_saved_state_goes_on_where_it_was(history, n_step, data):
 )
 def test_termination_counts_no_future_and_truncation_does(end, discounts):
     rewards, ends = np.array([[1.0], [2.0], [4.0]]), np.array([[RUNS], [RUNS], [end]])
-    rows = push_all(NStepAssembler(DTYPE, 1, 3, DISCOUNT), rewards, ends, range(3))
+    rows = push_all(NStepAssembler(ROW, 1, 3, DISCOUNT), rewards, ends, range(3))
     np.testing.assert_allclose(rows["discount"], discounts, rtol=1e-6)
     returns = [1 + 0.9 * 2 + 0.81 * 4, 2 + 0.9 * 4, 4.0]
     np.testing.assert_allclose(rows["reward"], returns[: len(rows)], rtol=1e-6)
@@ -101,7 +104,7 @@ def test_termination_counts_no_future_and_truncation_does(end, discounts):
 
 def test_clear_forgets_waiting_steps():
     rewards, ends = np.ones((4, 2)), np.zeros((4, 2), int)
-    assembler = NStepAssembler(DTYPE, 2, 3, DISCOUNT)
+    assembler = NStepAssembler(ROW, 2, 3, DISCOUNT)
     push_all(assembler, rewards, ends, range(2))
     assembler.clear()
     rows = push_all(assembler, rewards, ends, range(2, 4))

@@ -10,27 +10,41 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from actors import frame_ring
 from actors.replay import ReplayShard, Stored
 from actors.rollout import join_stats
+from actors.storage import save_rows
 from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
+from tests.packed import pack
 
 DTYPE = transition_dtype(gym.spaces.Box(-127, 127, (2, 3), np.int8))
 
 
 def make_block(numbers, sequence=0, worker_id=0, incarnation=0, schema=SCHEMA_VERSION, dtype=DTYPE):
-    """A block of rows that carry `numbers` in several columns."""
+    """A block of transitions that carry `numbers` in several columns; each leads to the next number.
+
+    Two in three lead to the row of that number, the third and the last one to frames.
+    """
+    numbers = np.asarray(numbers, np.int64)
     rows = np.zeros(len(numbers), dtype)
     rows["reward"] = rows["action"] = numbers
-    rows["next_observation"] = (np.asarray(numbers) % 100)[:, None, None]
+    rows["observation"], rows["next_observation"] = seen(numbers), seen(numbers + 1)
+    ahead = (numbers % 3 > 0) & (np.append(numbers[1:], -1) == numbers + 1)
     header = BlockHeader(schema, worker_id, incarnation, sequence, 0, 0.0, 0.0, len(numbers))
-    return TransitionBlock(header, rows, join_stats([]))
+    return TransitionBlock(header, pack(rows, ahead), join_stats([]))
+
+
+def seen(numbers):
+    """What is observed where an action is one of these numbers."""
+    return (numbers % 100)[:, None, None]
 
 
 def held(shard):
     """Numbers that can be drawn; misses one of 12 with probability 1e-22."""
     rows = shard.sample(600).rows
     np.testing.assert_array_equal(rows["reward"], rows["action"])
-    np.testing.assert_array_equal(rows["next_observation"], np.tile((rows["action"] % 100)[:, None, None], (1, 2, 3)))
+    for name, numbers in (("observation", rows["action"]), ("next_observation", rows["action"] + 1)):
+        np.testing.assert_array_equal(rows[name], np.tile(seen(numbers), (1, 2, 3)), err_msg=name)
     return set(rows["action"].tolist())
 
 
@@ -172,3 +186,58 @@ def test_state_of_another_save_is_refused(tmp_path):
     _, state = filled(tmp_path)
     with pytest.raises(ValueError, match="16 transitions"):
         ReplayShard(DTYPE, 16, 0).load(tmp_path / "shard.zarr", {**state, "size": 15})
+
+
+def test_frames_that_come_after_the_snapshot_are_not_in_it(tmp_path):
+    """The ring of the frames is written on, and made larger, before the snapshot is."""
+    shard = ReplayShard(DTYPE, 6_000, 11)
+    for sequence in range(9):
+        shard.add(make_block(range(1_000 * sequence, 1_000 * (sequence + 1)), sequence))
+    before = saved(shard, tmp_path)
+    snapshot = shard.snapshot()
+    for sequence in range(9, 40):
+        numbers = np.arange(1_000 * sequence, 1_000 * (sequence + 1))
+        shard.add(make_block(numbers[:: 1 + sequence % 2], sequence))  # of every other number all lead to frames
+    snapshot.save(tmp_path / "later.zarr")
+    one, two = ReplayShard(DTYPE, 6_000, 0), ReplayShard(DTYPE, 6_000, 0)
+    one.load(tmp_path / "shard.zarr", before)
+    two.load(tmp_path / "later.zarr", before)
+    for shard in (one, two):
+        assert set(shard.sample(200_000).rows["action"].tolist()) == set(range(3_000, 9_000))
+    np.testing.assert_array_equal(one.sample(5_000).rows, two.sample(5_000).rows)
+    held(two)
+
+
+def test_frames_are_given_up_with_their_rows():
+    shard = ReplayShard(DTYPE, 100, 0)
+    for sequence in range(60):
+        shard.add(make_block(range(70 * sequence, 70 * (sequence + 1)), sequence))
+        numbers = range(max(0, shard.inserted - 100), shard.inserted)
+        lead_to_frames = sum(number % 3 == 0 or number % 70 == 69 for number in numbers)
+        assert len(shard._frames.numbers) == lead_to_frames
+    assert len(shard._frames.frames) == frame_ring.SMALLEST
+
+
+@pytest.mark.parametrize(
+    ("slot", "next_row"), [(3, 13), (15, 1), (4, -(2**31)), (5, 2**31 - 1), (6, 0), (7, -1), (12, -5)]
+)
+def test_rows_that_lead_to_nothing_are_refused(tmp_path, slot, next_row):
+    """A file that was changed, checksums and all."""
+    shard = ReplayShard(DTYPE, 16, 0)
+    shard.add(make_block(range(16)))
+    state = saved(shard, tmp_path)
+    shard._rows["next_row"][slot] = next_row
+    save_rows(tmp_path / "shard.zarr", shard._rows)
+    save_rows(tmp_path / "shard.zarr" / "frames", shard._frames.snapshot())
+    with pytest.raises(ValueError, match=r"shard\.zarr has rows that lead to observations which it does not hold"):
+        ReplayShard(DTYPE, 16, 0).load(tmp_path / "shard.zarr", state)
+
+
+@pytest.mark.parametrize("numbers", [[0, 5], [1, 7], [7, 1], [0, 5_000]])
+def test_frames_of_another_moment_are_refused(tmp_path, numbers):
+    shard = ReplayShard(DTYPE, 16, 0)
+    shard.add(make_block(range(16)))
+    state = saved(shard, tmp_path)
+    assert state["frames"] == [0, 6]
+    with pytest.raises(ValueError, match="rows that lead to|no ring of frames"):
+        ReplayShard(DTYPE, 16, 0).load(tmp_path / "shard.zarr", {**state, "frames": numbers})

@@ -9,9 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from actors import ring_snapshot
+from actors.packing import packed_dtype
 from actors.replay import ReplayShard
 from actors.rollout import join_stats
 from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
+from tests.packed import pack
 
 DTYPE = transition_dtype(gym.spaces.Box(-127, 127, (3,), np.int8))
 
@@ -20,7 +22,7 @@ def add(shard, numbers, sequence):
     rows = np.zeros(len(numbers), DTYPE)
     rows["action"] = numbers
     header = BlockHeader(SCHEMA_VERSION, 0, 0, sequence, 0, 0.0, 0.0, len(numbers))
-    shard.add(TransitionBlock(header, rows, join_stats([])))
+    shard.add(TransitionBlock(header, pack(rows), join_stats([])))
 
 
 @given(
@@ -48,7 +50,7 @@ def test_inserts_between_any_two_reads_change_nothing(capacity, before, after, p
                 start = min(start + step, -(-len(snapshot) // step) * step)
         for rest in range(start, len(snapshot), step):
             found.append(snapshot.read(rest, min(len(snapshot), rest + step)))
-        rows = np.concatenate([np.zeros(0, DTYPE), *found])
+        rows = np.concatenate([np.zeros(0, packed_dtype(DTYPE)), *found])
         np.testing.assert_array_equal(rows, expected)
 
 

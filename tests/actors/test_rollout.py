@@ -7,11 +7,19 @@ import pytest
 
 from actors.network import Policy
 from actors.rollout import RolloutSettings, RolloutWorker, join_stats
-from actors.transitions import NO_OUTCOME, SCHEMA_VERSION, EpisodeStats
+from actors.transitions import NO_OUTCOME, SCHEMA_VERSION, EpisodeStats, transition_dtype
+from actors.vector_env import env_shape
 from sim_core.envs import SwarmVectorEnv
 from sim_core.outcomes import ENDED
+from tests.packed import unpack
 
 NUM_ENVS, STEPS = 4, 20
+
+
+def transitions_of(spec, blocks):
+    """Whole transitions of all blocks."""
+    dtype = transition_dtype(env_shape(spec).observation_space)
+    return np.concatenate([unpack(block.packed, dtype) for block in blocks])
 
 
 @pytest.fixture
@@ -30,7 +38,8 @@ def make_worker(make_weights):
 
 def assert_same_block(first, second):
     assert first.header == second.header._replace(made=first.header.made)  # counted from the start of the process
-    np.testing.assert_array_equal(first.rows, second.rows)
+    for a, b in zip(first.packed, second.packed, strict=True):
+        np.testing.assert_array_equal(a, b)
     for a, b in zip(first.episodes, second.episodes, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -57,7 +66,7 @@ def test_transitions_and_episodes_are_those_of_the_environment(swarm, make_worke
     arrays = worker.get_state()["arrays"]
     worlds = {name.removeprefix("world_"): array for name, array in arrays.items() if name.startswith("world_")}
     blocks = [worker.collect(1.0) for _ in range(4)]
-    rows = np.concatenate([block.rows for block in blocks])
+    rows = transitions_of(swarm, blocks)
     expected, ended = by_hand(swarm, worlds, rows)
     for name, column in zip(("observation", "reward", "discount", "next_observation"), expected, strict=True):
         np.testing.assert_array_equal(rows[name], column.astype(rows[name].dtype), err_msg=name)
@@ -70,7 +79,7 @@ def test_transitions_and_episodes_are_those_of_the_environment(swarm, make_worke
 
 
 def test_greedy_actions_are_the_policys(swarm, make_worker, make_weights):
-    rows = make_worker(swarm).collect(0.0).rows
+    rows = make_worker(swarm).collect(0.0).packed.rows
     policy = Policy(make_weights(swarm))
     np.testing.assert_array_equal(rows["action"], policy.greedy(rows["observation"]))
     assert len(set(rows["action"])) > 1
@@ -113,13 +122,13 @@ def test_every_worker_and_every_start_has_its_own_streams(swarm, make_worker):
     first = make_worker(swarm).collect(0.5)
     assert_same_block(first, make_worker(swarm).collect(0.5))
     for other in (make_worker(swarm, worker_id=4), make_worker(swarm, incarnation=2), make_worker(swarm, seed=8)):
-        assert not np.array_equal(other.collect(0.5).rows, first.rows)
+        assert not np.array_equal(other.collect(0.5).packed.rows, first.packed.rows)
 
 
 def test_an_environment_without_outcomes(cart_pole, make_worker):
     worker = make_worker(cart_pole)
     blocks = [worker.collect(1.0) for _ in range(6)]
-    rows, stats = np.concatenate([block.rows for block in blocks]), join_stats([block.episodes for block in blocks])
+    rows, stats = transitions_of(cart_pole, blocks), join_stats([block.episodes for block in blocks])
     assert (stats.outcome == NO_OUTCOME).all() and len(stats.outcome) >= 8
     np.testing.assert_array_equal(stats.episode_return, stats.length_steps)  # one reward a step
     fallen = rows["discount"] == 0
@@ -156,8 +165,8 @@ def test_a_block_shorter_than_n_holds_no_rows_yet(swarm, make_worker, make_weigh
     worker = RolloutWorker(RolloutSettings(swarm, 2, 1, 5, 0.9, 0), 0, 0)
     worker.set_weights(make_weights(swarm))
     block = worker.collect(0.0)
-    assert len(block.rows) == 0 and block.header.env_steps == 2
-    assert sum(len(worker.collect(0.0).rows) for _ in range(60)) > 80
+    assert block.transitions == 0 and block.header.env_steps == 2
+    assert sum(worker.collect(0.0).transitions for _ in range(60)) > 80
 
 
 def test_join_stats():

@@ -9,6 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from actors.packing import packed_bytes
 from actors.rollout import join_stats
 from actors.shard_node import ShardNode, ShardSettings
 from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
@@ -16,8 +17,10 @@ from learner.config import RunConfig
 from tests.benchmarks.ray_service import ray_service
 from tests.benchmarks.timing import spread
 from tests.checkpointing import Silent
+from tests.packed import pack_as_collected
 
-BLOCK = 2_048
+BLOCK, SHAPE = 2_048, (32, 3)
+"""Transitions of a block; its steps of 64 environments, and the steps that a transition spans."""
 ROUNDS = 5
 CHECKPOINTS = 6
 TARGET_MS = 100.0
@@ -35,8 +38,9 @@ class FilledShard:
     def __init__(self, size: int, capacity: int) -> None:
         self.dtype = transition_dtype(gym.spaces.Box(-1, 1, (size,), np.float32))
         self.node = ShardNode(ShardSettings(self.dtype, capacity, 0))
-        self._rows = np.zeros(BLOCK, self.dtype)
-        self._rows["observation"] = np.random.default_rng(0).normal(size=(BLOCK, size))
+        rows = np.zeros(BLOCK, self.dtype)
+        rows["observation"] = np.random.default_rng(0).normal(size=(BLOCK, size))
+        self._packed = pack_as_collected(rows)
         self._sequence = 0
         while self.node.size() < capacity:
             self.add()
@@ -44,7 +48,7 @@ class FilledShard:
     def add(self) -> None:
         header = BlockHeader(SCHEMA_VERSION, 0, 0, self._sequence, 0, 0.0, 0.0, BLOCK)
         self._sequence += 1
-        self.node.add(TransitionBlock(header, self._rows, join_stats([])))
+        self.node.add(TransitionBlock(header, self._packed, join_stats([])))
 
     def step(self) -> None:
         """What a shard does between two checkpoints."""
@@ -65,9 +69,9 @@ def shard_row(size: int, capacity: int) -> list[str]:
                 writing.append(milliseconds(shard.step))
             seconds.append(time.perf_counter() - start_s)
             assert written.error is None, written.error
-    megabytes = capacity * shard.dtype.itemsize / 1e6
+    row = packed_bytes(shard.dtype, *SHAPE)
     return [
-        f"{capacity:,} × {shard.dtype.itemsize} B = {megabytes:,.0f} MB",
+        f"{capacity:,} × {row:.0f} B = {capacity * row / 1e6:,.0f} MB",
         spread(snapshots).text(2),
         f"{np.median(quiet):.1f}, at most {max(quiet):.1f}",
         f"{np.median(writing):.1f}, at most {max(writing):.1f}",

@@ -1,10 +1,10 @@
 """Million transitions per CPU second into and out of one replay shard, beside the buffers of other projects.
 
 CPU time of the process counts, all threads together, so that other work on the machine does not. Observations are 72
-float32. A block comes as each buffer likes it best: in packed rows for ours, as rollout workers push it, in columns for
-the others. A draw ends where an update begins: each column contiguous, in the learner's dtypes, and for prioritised
-draws with importance weights. Peers come with the extra `peers`; one that is not installed, or cannot do its part with
-the PyTorch that is, is named and left out.
+float32. A block comes as each buffer likes it best: packed for ours, as rollout workers push it (64 environments,
+3-step transitions), in columns for the others. A draw ends where an update begins: each column contiguous, in the
+learner's dtypes, and for prioritised draws with importance weights. Peers come with the extra `peers`; one that is not
+installed, or cannot do its part with the PyTorch that is, is named and left out.
 """
 
 import importlib.util
@@ -26,10 +26,11 @@ from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock, tra
 from learner.double_dqn import importance_weights
 from learner.learner import Columns
 from tests.benchmarks.timing import ratio, spread, stopwatch, timed_rates
+from tests.packed import pack_as_collected
 
 SPACE = Box(-np.inf, np.inf, (72,), np.float32)
 CAPACITY = 100_000
-BLOCK, BATCH, SUPER_BATCH = 2_048, 256, 8_192
+BLOCK, ENVS, BATCH, SUPER_BATCH = 2_048, 64, 256, 8_192
 ALPHA, BETA = 0.6, 0.4
 ROUNDS = 7
 ADDED, DRAWN = 100 * BLOCK, 8 * SUPER_BATCH
@@ -51,12 +52,12 @@ class Rival(NamedTuple):
 def shoal_rival(prioritised: bool) -> Rival:
     priorities = PrioritySettings(ALPHA, BATCH) if prioritised else None
     shard = make_shard(ShardSettings(transition_dtype(SPACE), CAPACITY, 0, priorities))
-    rows, episodes = np.zeros(BLOCK, transition_dtype(SPACE)), join_stats([])
+    packed, episodes = pack_as_collected(np.zeros(BLOCK, transition_dtype(SPACE)), ENVS), join_stats([])
     sequence, columns_of = iter(range(10**9)), Columns()
 
     def add() -> None:
         header = BlockHeader(SCHEMA_VERSION, 0, 0, next(sequence), 0, 0.0, 0.0, BLOCK)
-        shard.add(TransitionBlock(header, rows, episodes))
+        shard.add(TransitionBlock(header, packed, episodes))
 
     def draw(count: int) -> object:
         reply = shard.sample(count)
@@ -85,13 +86,12 @@ def sb3_rival(prioritised: bool) -> Rival | str:
         return "has none"
     from stable_baselines3.common.buffers import ReplayBuffer
 
-    envs = 64
-    buffer = ReplayBuffer(CAPACITY, SPACE, Discrete(9), n_envs=envs, device="cpu")
-    observation = np.zeros((envs, 72), np.float32)
-    action, flags, infos = np.zeros((envs, 1), np.int64), np.zeros(envs), [{}] * envs
+    buffer = ReplayBuffer(CAPACITY, SPACE, Discrete(9), n_envs=ENVS, device="cpu")
+    observation = np.zeros((ENVS, 72), np.float32)
+    action, flags, infos = np.zeros((ENVS, 1), np.int64), np.zeros(ENVS), [{}] * ENVS
 
     def add() -> None:
-        for _ in range(BLOCK // envs):
+        for _ in range(BLOCK // ENVS):
             buffer.add(observation, observation, action, flags, flags, infos)
 
     return Rival(add, buffer.sample, None)

@@ -9,6 +9,7 @@ import psutil
 from rich.console import Console
 from rich.table import Table
 
+from actors.packing import packed_bytes
 from actors.transitions import transition_dtype
 from actors.vector_env import env_shape
 from learner.cluster import learner_settings
@@ -137,10 +138,11 @@ def draw(points: dict[tuple[int, float], Point], costs: Costs, work: Work, cores
 def work_of(config: RunConfig) -> Work:
     shape = env_shape(config.env)
     arrays = Learner(learner_settings(config, shape)).weights(0.0).arrays
-    row = transition_dtype(shape.observation_space).itemsize
+    row = transition_dtype(shape.observation_space)
+    packed = packed_bytes(row, config.steps_per_block, config.n_step)
     weights = sum(array.nbytes for array in arrays)
     sizes = (config.batch_size, config.updates_per_call)
-    return Work(config.block_env_steps, config.samples_per_insert, *sizes, row, weights)
+    return Work(config.block_env_steps, config.samples_per_insert, *sizes, packed, row.itemsize, weights)
 
 
 def main(picture: bool) -> None:
@@ -159,7 +161,8 @@ def main(picture: bool) -> None:
     console.print(learners_table(costs, work, update_seconds(config), sum_seconds(floats)))
     learner = seconds_per_env_step(costs, work, 0)[LEARNER]
     console.print(
-        f"{work.row_bytes} bytes a transition, {work.weights_bytes:,} a copy of the weights; the learner's "
+        f"{work.packed_bytes:.1f} bytes a transition in a block, {work.row_bytes} in a sample, "
+        f"{work.weights_bytes:,} a copy of the weights; the learner's "
         f"{microseconds(learner)} µs per env step are {work.samples_per_insert:g} samples",
         highlight=False,
     )

@@ -34,12 +34,13 @@ class Costs(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Sizes that a run's config sets, and the bytes of one packed transition and of the weights."""
+    """Sizes that a run's config sets, and the bytes of one transition, packed and whole, and of the weights."""
 
     block_env_steps: int
     samples_per_insert: float
     batch_size: int
     updates_per_call: int
+    packed_bytes: float
     row_bytes: int
     weights_bytes: int
 
@@ -119,7 +120,7 @@ def network_bytes(work: Work, workers: float, shards: int) -> float:
     """
     samples = work.samples_per_insert if shards else 0.0
     versions = min(workers * work.calls_per_env_step, 1 / work.block_env_steps) + shards * work.calls_per_env_step
-    return (1 + samples) * work.row_bytes + versions * work.weights_bytes
+    return work.packed_bytes + samples * work.row_bytes + versions * work.weights_bytes
 
 
 def messages(work: Work, shards: int) -> float:

@@ -59,7 +59,13 @@ def final_state(folder: Path):
     arrays = {}
     for path in sorted(checkpoint.folder.glob("*.safetensors")):
         arrays |= {f"{path.stem}/{name}": array for name, array in load_file(path).items()}
-    for path in sorted([*checkpoint.folder.glob("*.zarr"), *checkpoint.folder.glob("*.zarr/priorities")]):
+    for path in sorted(
+        [
+            *checkpoint.folder.glob("*.zarr"),
+            *checkpoint.folder.glob("*.zarr/priorities"),
+            *checkpoint.folder.glob("*.zarr/frames"),
+        ]
+    ):
         root = zarr.open_group(str(path), mode="r")
         arrays |= {
             f"{path.relative_to(checkpoint.folder)}/{name}": np.asarray(array[...]) for name, array in root.arrays()

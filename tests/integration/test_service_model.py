@@ -25,6 +25,7 @@ WORK = Work(
     samples_per_insert=2.0,
     batch_size=50,
     updates_per_call=4,
+    packed_bytes=30.0,
     row_bytes=40,
     weights_bytes=3_000,
 )
@@ -93,9 +94,9 @@ def test_several_learners_share_the_rows_and_pay_for_every_step_of_the_ring():
 
 def test_bytes_and_messages():
     versions = 1 / 100  # as many as blocks
-    assert network_bytes(WORK, 9, 0) == 40 + versions * 3_000
-    assert network_bytes(WORK, 9, 4) == pytest.approx(3 * 40 + 5 * versions * 3_000)
+    assert network_bytes(WORK, 9, 0) == 30 + versions * 3_000
+    assert network_bytes(WORK, 9, 4) == pytest.approx(30 + 2 * 40 + 5 * versions * 3_000)
     seldom = WORK._replace(samples_per_insert=0.2)
-    assert network_bytes(seldom, 3, 0) == pytest.approx(40 + 0.3 * versions * 3_000)
+    assert network_bytes(seldom, 3, 0) == pytest.approx(30 + 0.3 * versions * 3_000)
     assert messages(WORK, 0) == pytest.approx(2 / 100 + 1 / 100)
     assert messages(WORK, 3) == pytest.approx(2 / 100 + 7 / 100)

@@ -263,13 +263,13 @@ def test_what_was_skipped_on_resume_goes_and_does_not_push_out_what_is_good(tmp_
 
 
 @pytest.mark.parametrize(
-    ("found", "kind"), [(1, UselessCheckpointError), (3, UselessCheckpointError), (5, CheckpointError)]
+    ("found", "kind"), [(1, UselessCheckpointError), (3, UselessCheckpointError), (6, CheckpointError)]
 )
 def test_another_format_is_refused_by_name(folder, found, kind):
     """Up to version 3 the manifest was one JSON object without a checksum of its own."""
     text = json.dumps({"format": f"shoal-checkpoint-{found}", "env_steps": 1, "sha256": {"state.json": "0" * 64}})
     (folder / "manifest.json").write_text(text)
-    match = f"'shoal-checkpoint-{found}', this version reads 'shoal-checkpoint-4'"
+    match = f"'shoal-checkpoint-{found}', this version reads 'shoal-checkpoint-5'"
     with pytest.raises(CheckpointError, match=match) as caught:
         read(folder)
     assert type(caught.value) is kind

@@ -55,7 +55,7 @@ def test_a_name_that_leads_elsewhere_is_refused(name):
     [None, 3, "0" * 64, [], [3], [3, "0" * 63], [3, "G" * 64], [-1, "0" * 64], [True, "0" * 64], [1.5, "0" * 64]],
 )
 def test_a_sum_that_is_none_is_refused(found):
-    values = {"format": "shoal-checkpoint-4", "env_steps": 1, "files": {"state.json": [3, "0" * 64], "a": found}}
+    values = {"format": "shoal-checkpoint-5", "env_steps": 1, "files": {"state.json": [3, "0" * 64], "a": found}}
     with pytest.raises(UselessCheckpointError, match="no length and SHA-256"):
         decode_manifest(signed(values), "x")
 
@@ -63,7 +63,7 @@ def test_a_sum_that_is_none_is_refused(found):
 @pytest.mark.parametrize("files", [None, [], 7, "x", {}, {"other": [3, "0" * 64]}])
 @pytest.mark.parametrize("env_steps", [1, -1, "1", None, True, 1.5])
 def test_other_types_are_refused(files, env_steps):
-    values = {"format": "shoal-checkpoint-4", "env_steps": env_steps, "files": files}
+    values = {"format": "shoal-checkpoint-5", "env_steps": env_steps, "files": files}
     with pytest.raises(UselessCheckpointError, match="other content than a manifest"):
         decode_manifest(signed(values), "x")
 
@@ -87,10 +87,10 @@ def test_json_without_end_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("version", "kind"), [(1, UselessCheckpointError), (3, UselessCheckpointError), (5, CheckpointError)]
+    ("version", "kind"), [(1, UselessCheckpointError), (4, UselessCheckpointError), (6, CheckpointError)]
 )
 def test_another_version_is_refused_by_name(version, kind):
-    with pytest.raises(CheckpointError, match=f"shoal-checkpoint-{version}.*shoal-checkpoint-4") as caught:
+    with pytest.raises(CheckpointError, match=f"shoal-checkpoint-{version}.*shoal-checkpoint-5") as caught:
         decode_manifest(signed({"format": f"shoal-checkpoint-{version}"}), "runs/r")
     assert type(caught.value) is kind
 

@@ -18,13 +18,14 @@ from learner.double_dqn import importance_weights
 from learner.learner import Learner
 from learner.node import LearnerNode
 from tests.checkpointing import saved
+from tests.packed import pack
 
 RATE = 1e-3
 
 
 def make_block(rows, sequence=0, worker_id=0, incarnation=0, version=0, schema=SCHEMA_VERSION):
     header = BlockHeader(schema, worker_id, incarnation, sequence, version, 0.0, 0.0, len(rows))
-    return TransitionBlock(header, rows, join_stats([]))
+    return TransitionBlock(header, pack(rows), join_stats([]))
 
 
 @pytest.fixture

@@ -1,0 +1,34 @@
+"""Packed transitions from whole ones, and back, the plain way."""
+
+import numpy as np
+
+from actors.packing import Packed, packed_dtype
+
+
+def pack(transitions, next_row=None):
+    """Packed rows; each leads to a frame of its own, but for those that `next_row` [count] gives a row ahead."""
+    rows = np.zeros(len(transitions), packed_dtype(transitions.dtype))
+    for name in ("reward", "discount", "action", "observation"):
+        rows[name] = transitions[name]
+    ahead = np.zeros(len(rows), np.int32) if next_row is None else np.asarray(next_row, np.int32)
+    to_frame = ahead <= 0
+    rows["next_row"] = np.where(to_frame, 1 - np.cumsum(to_frame), ahead)
+    return Packed(rows, transitions["next_observation"][to_frame])
+
+
+def pack_as_collected(transitions, envs=64, n_step=3):
+    """Packed rows as a rollout worker makes them of running episodes; what a transition led to is not looked at."""
+    ahead = np.full(len(transitions), envs * n_step)
+    ahead[-envs * n_step :] = 0
+    return pack(transitions, ahead)
+
+
+def unpack(packed, dtype):
+    """Whole transitions of `dtype`."""
+    transitions = np.zeros(len(packed.rows), dtype)
+    for name in ("reward", "discount", "action", "observation"):
+        transitions[name] = packed.rows[name]
+    for i, next_row in enumerate(packed.rows["next_row"].tolist()):
+        reached = packed.rows["observation"][i + next_row] if next_row > 0 else packed.frames[-next_row]
+        transitions["next_observation"][i] = reached
+    return transitions
