@@ -109,3 +109,18 @@ def test_clear_forgets_waiting_steps():
     assembler.clear()
     rows = push_all(assembler, rewards, ends, range(2, 4))
     assert len(rows) == 0
+
+
+@given(history=histories(), n_step=st.integers(1, 5), cut=st.integers(0, 6))
+@settings(max_examples=100, deadline=None)
+def test_only_what_no_row_begins_with_is_kept_as_a_frame(history, n_step, cut):
+    rewards, ends = history
+    assembler = NStepAssembler(ROW, rewards.shape[1], n_step, DISCOUNT)
+    for part in (range(cut), range(cut, len(rewards))):
+        packed = assembler.push(steps_of(rewards, ends, [step for step in part if step < len(rewards)]))
+        begun = set(map(tuple, packed.rows["observation"].tolist()))
+        reached = unpack(packed, DTYPE)["next_observation"].astype(int)
+        ended = [ends[t - 1, env] != RUNS for env, t in reached.tolist()]
+        expected = [end or (env, t) not in begun for end, (env, t) in zip(ended, reached.tolist(), strict=True)]
+        np.testing.assert_array_equal(packed.rows["next_row"] <= 0, expected)
+        assert len(packed.frames) == sum(expected)
