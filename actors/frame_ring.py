@@ -14,6 +14,8 @@ from actors.storage import load_rows
 
 SMALLEST = 1_024
 """Frames that there is room for at first."""
+LAST = 2**62
+"""No number of a frame is greater."""
 
 
 class FrameRing:
@@ -47,7 +49,7 @@ class FrameRing:
         self._first += count
 
     def push(self, frames: NDArray[Any]) -> int:
-        """Takes frames `[count, *shape]`; returns the number of the first one."""
+        """Takes frames `[count, *shape]` of the ring's dtype; returns the number of the first one."""
         number = self._next
         self._make_room(self._next - self._first + len(frames))
         self._write(number, as_bytes(frames))
@@ -65,11 +67,13 @@ class FrameRing:
         """Doubles the ring until it has `count` places; a snapshot keeps the old one, which changes no more."""
         if count <= len(self._ring):
             return
-        held = np.arange(self._first, self._next) % len(self._ring)
-        frames = as_bytes(self._ring)[held]
+        old, start, held = as_bytes(self._ring), self._first % len(self._ring), self._next - self._first
         self._ring = np.zeros(1 << (count - 1).bit_length(), self._dtype)
         self._snapshot = RingSnapshot(self._ring, 0)
-        self._write(self._first, frames)
+        self._write(self._first, old[start : start + held])
+        rest = start + held - len(old)
+        if rest > 0:
+            self._write(self._next - rest, old[:rest])
 
     def snapshot(self) -> RingSnapshot:
         """All places as they are now; one taken before may not be written any more."""
@@ -86,9 +90,12 @@ class FrameRing:
         Raises:
           ValueError: they are damaged, do not fit each other, or are more than `at_most` frames ask for.
         """
-        most = max(SMALLEST, 1 << (at_most - 1).bit_length())
-        ring, (first, after) = load_rows(path, self._dtype, at_most=most), state
-        if len(ring) < SMALLEST or len(ring) & (len(ring) - 1) or not 0 <= after - first <= len(ring):
-            raise ValueError(f"{path} has {len(ring)} places, which is no ring of frames {first} to {after}")
+        if not (isinstance(state, list) and len(state) == 2 and all(type(number) is int for number in state)):
+            raise ValueError(f"the numbers of the frames at {path} are {state!r}, not two whole numbers")
+        (first, after), most = state, max(SMALLEST, 1 << (at_most - 1).bit_length())
+        ring = load_rows(path, self._dtype, at_most=most)
+        places = len(ring)
+        if places < SMALLEST or places & (places - 1) or not 0 <= first <= after <= min(first + places, LAST):
+            raise ValueError(f"{path} has {places} places, which is no ring of frames {first} to {after}")
         self._ring, self._first, self._next = ring, first, after
         self._snapshot = RingSnapshot(self._ring, 0)

@@ -87,7 +87,9 @@ class NStepAssembler:
         written = _Rows(
             rows["reward"], rows["discount"], rows["action"], rows["next_row"], as_bytes(rows), as_bytes(frames)
         )
-        columns = _Columns(_as_bytes(window.observation), _as_bytes(window.reached), *window[1:3], *window[4:])
+        columns = _Columns(
+            _steps_as_bytes(window.observation), _steps_as_bytes(window.reached), *window[1:3], *window[4:]
+        )
         begun = _Begun(np.full(shape, -1), np.empty(len(rows), np.int64))
         waits, fields = np.zeros_like(self._waits), self._dtype.fields
         assert fields is not None
@@ -145,7 +147,7 @@ class _Begun(NamedTuple):
     last: NDArray[np.int64]
 
 
-def _as_bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
+def _steps_as_bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(array).reshape(*array.shape[:2], math.prod(array.shape[2:])).view(np.uint8)
 
 

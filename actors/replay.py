@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.frame_ring import FrameRing
-from actors.packing import NUMBERS, Packed, as_bytes, count_frames, packed_dtype, renumber, unpack
+from actors.packing import Packed, as_bytes, count_frames, leads, packed_dtype, renumber, unpack
 from actors.ring_snapshot import RingSnapshot
 from actors.storage import load_rows, save_rows
 from actors.transitions import SCHEMA_VERSION, BlockHeader, SampleReply, TransitionBlock
@@ -100,13 +100,15 @@ class ReplayShard:
         """Stores a block once.
 
         Raises:
-          ValueError: the block has another schema or row layout.
+          ValueError: the block has another schema or layout, or its rows do not fit its frames.
         """
         header, count = block.header, block.transitions
-        if header.schema_version != SCHEMA_VERSION or block.packed.rows.dtype != self._rows.dtype:
+        rows, frames = block.packed
+        if header.schema_version != SCHEMA_VERSION or not block.packed.is_sound(self._rows.dtype):
             raise ValueError(
-                f"block of worker {header.worker_id} has schema {header.schema_version} and rows "
-                f"{block.packed.rows.dtype}, this shard takes schema {SCHEMA_VERSION} and rows {self._rows.dtype}"
+                f"block of worker {header.worker_id} has schema {header.schema_version}, rows {rows.dtype}, and "
+                f"{len(frames)} frames {frames.dtype}{frames.shape[1:]}; this shard takes schema {SCHEMA_VERSION}, rows "
+                f"{self._rows.dtype}, and the frames that they lead to"
             )
         if not self._is_new(header):
             self._dropped += count
@@ -195,20 +197,12 @@ class ReplayShard:
         capacity = len(self._rows)
         if state["next"] != (len(rows) if len(rows) < capacity else state["next"] % capacity):
             raise ValueError(f"{path} is the ring of a shard with another capacity than {capacity}")
-        self._frames.load(path / FRAMES, state["frames"], at_most=capacity)
-        _check_links(path, np.roll(rows, -state["next"]), self._frames.numbers)
-        self._rows[: len(rows)] = rows
+        frames = FrameRing(self._dtype["observation"])
+        frames.load(path / FRAMES, state["frames"], at_most=capacity)
+        if not leads(np.roll(rows["next_row"], -state["next"]), frames.numbers):
+            raise ValueError(f"{path} has rows that lead to observations which it does not hold")
+        self._rows[: len(rows)], self._frames = rows, frames
         self._next, self._size = state["next"], state["size"]
         self._inserted, self._dropped = state["inserted"], state["dropped"]
         self._newest = {worker: (incarnation, sequence) for worker, incarnation, sequence in state["newest"]}
         self._rng.bit_generator.state = state["rng"]
-
-
-def _check_links(path: Path, rows: NDArray[Any], frames: range) -> None:
-    """Refuses rows, oldest first, that lead to anything but each other and these frames."""
-    next_row = rows["next_row"]
-    to_frame = next_row <= 0
-    numbers = np.arange(frames.start, frames.stop) % NUMBERS
-    beyond = np.arange(len(rows)) + next_row >= len(rows)
-    if beyond[~to_frame].any() or not np.array_equal(-next_row[to_frame], numbers):
-        raise ValueError(f"{path} has rows that lead to observations which it does not hold")

@@ -6,7 +6,7 @@ import itertools
 
 import psutil
 
-from actors.packing import packed_bytes
+from actors.packing import frames_of, packed_dtype
 from actors.transitions import transition_dtype
 from actors.vector_env import EnvShape, env_shape
 from learner.config import RunConfig
@@ -20,6 +20,8 @@ EPISODE_BYTES = 100
 """Of one evaluated episode: its seed and its result."""
 PRIORITY_BYTES = 32
 """Of one transition's priority: the sum tree has twice as many float64, of which half may lie idle."""
+FRAME_PLACES = 2
+"""Of one frame of the replay: their number is a power of 2, of which half may be empty."""
 NETWORK_COPIES = 5
 """Online and target network, gradients, and Adam's two moments."""
 
@@ -27,7 +29,8 @@ NETWORK_COPIES = 5
 def parts_bytes(config: RunConfig, shape: EnvShape) -> dict[str, int]:
     """Bytes of each part, by the settings that decide its size."""
     transition = transition_dtype(shape.observation_space)
-    row, packed = transition.itemsize, packed_bytes(transition, config.steps_per_block, config.n_step)
+    row, packed = transition.itemsize, packed_dtype(transition).itemsize
+    frames = frames_of(config.replay_capacity, config.steps_per_block, config.n_step)
     priority = PRIORITY_BYTES if config.replay == "prioritised" else 0
     widths = [shape.observation_size, *config.policy_sizes, shape.num_actions]
     weights = sum(inputs * outputs + outputs for inputs, outputs in itertools.pairwise(widths))
@@ -40,7 +43,8 @@ def parts_bytes(config: RunConfig, shape: EnvShape) -> dict[str, int]:
         * config.envs_per_worker
         * (config.steps_per_block + config.n_step)
         * row,
-        "replay_capacity": int(config.replay_capacity * (packed + priority)),
+        "replay_capacity": config.replay_capacity * (packed + priority)
+        + FRAME_PLACES * frames * transition["observation"].itemsize,
         "batch_size and updates_per_call": 3 * config.batch_size * config.updates_per_call * row,
         "hidden_sizes": 4 * NETWORK_COPIES * weights,
         "eval_episodes and final_eval_episodes": EPISODE_BYTES * max(config.eval_episodes, config.final_eval_episodes),

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from actors import frame_ring
+from actors import frame_ring, packing
 from actors.replay import ReplayShard, Stored
 from actors.rollout import join_stats
 from actors.storage import save_rows
@@ -39,9 +39,9 @@ def seen(numbers):
     return (numbers % 100)[:, None, None]
 
 
-def held(shard):
-    """Numbers that can be drawn; misses one of 12 with probability 1e-22."""
-    rows = shard.sample(600).rows
+def held(shard, draws=600):
+    """Numbers that can be drawn; 600 draws miss one of 12 with probability 1e-22, 5,000 one of 100 with 1e-20."""
+    rows = shard.sample(draws).rows
     np.testing.assert_array_equal(rows["reward"], rows["action"])
     for name, numbers in (("observation", rows["action"]), ("next_observation", rows["action"] + 1)):
         np.testing.assert_array_equal(rows[name], np.tile(seen(numbers), (1, 2, 3)), err_msg=name)
@@ -219,7 +219,7 @@ def test_frames_are_given_up_with_their_rows():
 
 
 @pytest.mark.parametrize(
-    ("slot", "next_row"), [(3, 13), (15, 1), (4, -(2**31)), (5, 2**31 - 1), (6, 0), (7, -1), (12, -5)]
+    ("slot", "next_row"), [(4, 12), (13, 3), (3, 12), (15, 1), (4, -(2**31)), (5, 2**31 - 1), (6, 0), (7, -1), (12, -5)]
 )
 def test_rows_that_lead_to_nothing_are_refused(tmp_path, slot, next_row):
     """A file that was changed, checksums and all."""
@@ -233,11 +233,81 @@ def test_rows_that_lead_to_nothing_are_refused(tmp_path, slot, next_row):
         ReplayShard(DTYPE, 16, 0).load(tmp_path / "shard.zarr", state)
 
 
-@pytest.mark.parametrize("numbers", [[0, 5], [1, 7], [7, 1], [0, 5_000]])
+@pytest.mark.parametrize(
+    "numbers",
+    [[0, 5], [1, 7], [7, 1], [0, 5_000], [-6, 0], [2**70, 2**70 + 6], [False, 6], [0.0, 6.0], ["0", "6"], [0], 6, None],
+)
 def test_frames_of_another_moment_are_refused(tmp_path, numbers):
     shard = ReplayShard(DTYPE, 16, 0)
     shard.add(make_block(range(16)))
     state = saved(shard, tmp_path)
     assert state["frames"] == [0, 6]
-    with pytest.raises(ValueError, match="rows that lead to|no ring of frames"):
-        ReplayShard(DTYPE, 16, 0).load(tmp_path / "shard.zarr", {**state, "frames": numbers})
+    other = ReplayShard(DTYPE, 16, 0)
+    other.add(make_block(range(100, 116)))
+    with pytest.raises(ValueError, match="rows that lead to|no ring of frames|two whole numbers"):
+        other.load(tmp_path / "shard.zarr", {**state, "frames": numbers})
+    assert held(other) == set(range(100, 116))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda packed: packed._replace(frames=packed.frames[:-1]),
+        lambda packed: packed._replace(frames=np.concatenate([packed.frames, packed.frames[:1]])),
+        lambda packed: packed._replace(frames=packed.frames.astype(np.float32)),
+        lambda packed: packed._replace(frames=packed.frames.reshape(-1, 3, 2)),
+        lambda packed: packed._replace(frames=packed.frames[:, :1]),
+        lambda packed: with_next_row(packed, 4, 12),
+        lambda packed: with_next_row(packed, 0, -1),
+        lambda packed: with_next_row(packed, 5, 0),
+    ],
+)
+def test_rows_that_do_not_fit_their_frames_are_refused_and_may_be_sent_again(change):
+    shard, block = ReplayShard(DTYPE, 100, 0), make_block(range(16))
+    with pytest.raises(ValueError, match="and the frames that they lead to"):
+        shard.add(block._replace(packed=change(block.packed)))
+    assert (shard.size, shard.inserted, shard.dropped) == (0, 0, 0)
+    assert shard.add(block) == Stored(16, False) and held(shard) == set(range(16))
+
+
+def with_next_row(packed, slot, next_row):
+    """The same with another `next_row` in one slot."""
+    rows = packed.rows.copy()
+    rows["next_row"][slot] = next_row
+    return packed._replace(rows=rows)
+
+
+def test_numbers_of_frames_begin_anew(tmp_path):
+    shard = ReplayShard(DTYPE, 100, 0)
+    shard._frames._first = shard._frames._next = packing.NUMBERS - 20
+    for sequence in range(8):
+        shard.add(make_block(range(30 * sequence, 30 * (sequence + 1)), sequence))
+        assert held(shard, 5_000) == set(range(max(0, shard.inserted - 100), shard.inserted))
+        again = ReplayShard(DTYPE, 100, 0)
+        again.load(tmp_path / "shard.zarr", saved(shard, tmp_path))
+        assert held(again, 5_000) == held(shard, 5_000)
+    assert shard._frames.numbers.stop > packing.NUMBERS
+
+
+@pytest.mark.parametrize(
+    "observation", [gym.spaces.Box(-1, 1, (), np.float32), gym.spaces.Box(-1, 1, (3,), np.float64)]
+)
+def test_observations_of_any_shape(observation):
+    rows = np.zeros(9, transition_dtype(observation))
+    rows["observation"] = np.arange(9).reshape(9, *[1] * len(observation.shape))
+    rows["next_observation"] = rows["observation"] + 1
+    header = BlockHeader(SCHEMA_VERSION, 0, 0, 0, 0, 0.0, 0.0, 9)
+    shard = ReplayShard(rows.dtype, 9, 0)
+    shard.add(TransitionBlock(header, pack(rows, [1, 0, 1, 1, 1, 0, 1, 1, 0]), join_stats([])))
+    drawn = shard.sample(200).rows
+    np.testing.assert_array_equal(drawn["next_observation"], drawn["observation"] + 1)
+    assert len({row.tobytes() for row in drawn}) == 9
+
+
+def test_rows_that_are_equal_are_so_in_every_byte():
+    space = gym.spaces.Box(-1, 1, (3,), np.int8)
+    rows = np.zeros(4, transition_dtype(space))
+    header = BlockHeader(SCHEMA_VERSION, 0, 0, 0, 0, 0.0, 0.0, 4)
+    shard = ReplayShard(rows.dtype, 4, 0)
+    shard.add(TransitionBlock(header, pack(rows), join_stats([])))
+    assert len({row.tobytes() for row in shard.sample(3_000).rows}) == 1

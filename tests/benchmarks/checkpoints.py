@@ -9,7 +9,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from actors.packing import packed_bytes
 from actors.rollout import join_stats
 from actors.shard_node import ShardNode, ShardSettings
 from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
@@ -19,8 +18,7 @@ from tests.benchmarks.timing import spread
 from tests.checkpointing import Silent
 from tests.packed import pack_as_collected
 
-BLOCK, SHAPE = 2_048, (32, 3)
-"""Transitions of a block; its steps of 64 environments, and the steps that a transition spans."""
+BLOCK = 2_048
 ROUNDS = 5
 CHECKPOINTS = 6
 TARGET_MS = 100.0
@@ -69,9 +67,10 @@ def shard_row(size: int, capacity: int) -> list[str]:
                 writing.append(milliseconds(shard.step))
             seconds.append(time.perf_counter() - start_s)
             assert written.error is None, written.error
-    row = packed_bytes(shard.dtype, *SHAPE)
+    rings = shard.node.shard.snapshot()
+    megabytes = sum(len(ring) * ring.dtype.itemsize for ring in (rings.rows, rings.frames)) / 1e6
     return [
-        f"{capacity:,} × {row:.0f} B = {capacity * row / 1e6:,.0f} MB",
+        f"{capacity:,} of {rings.rows.dtype.itemsize} B, frames: {megabytes:,.0f} MB",
         spread(snapshots).text(2),
         f"{np.median(quiet):.1f}, at most {max(quiet):.1f}",
         f"{np.median(writing):.1f}, at most {max(writing):.1f}",

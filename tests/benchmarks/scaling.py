@@ -9,7 +9,7 @@ import psutil
 from rich.console import Console
 from rich.table import Table
 
-from actors.packing import packed_bytes
+from actors.packing import frames_of, packed_dtype
 from actors.transitions import transition_dtype
 from actors.vector_env import env_shape
 from learner.cluster import learner_settings
@@ -139,7 +139,8 @@ def work_of(config: RunConfig) -> Work:
     shape = env_shape(config.env)
     arrays = Learner(learner_settings(config, shape)).weights(0.0).arrays
     row = transition_dtype(shape.observation_space)
-    packed = packed_bytes(row, config.steps_per_block, config.n_step)
+    frames = frames_of(config.block_env_steps, config.steps_per_block, config.n_step)
+    packed = packed_dtype(row).itemsize + frames / config.block_env_steps * row["observation"].itemsize
     weights = sum(array.nbytes for array in arrays)
     sizes = (config.batch_size, config.updates_per_call)
     return Work(config.block_env_steps, config.samples_per_insert, *sizes, packed, row.itemsize, weights)
