@@ -107,8 +107,8 @@ class ReplayShard:
         if header.schema_version != SCHEMA_VERSION or not block.packed.is_sound(self._rows.dtype):
             raise ValueError(
                 f"block of worker {header.worker_id} has schema {header.schema_version}, rows {rows.dtype}, and "
-                f"{len(frames)} frames {frames.dtype}{frames.shape[1:]}; this shard takes schema {SCHEMA_VERSION}, rows "
-                f"{self._rows.dtype}, and the frames that they lead to"
+                f"{len(frames)} frames {frames.dtype}{frames.shape[1:]}; this shard takes schema {SCHEMA_VERSION}, "
+                f"rows {self._rows.dtype}, and the frames that they lead to"
             )
         if not self._is_new(header):
             self._dropped += count
