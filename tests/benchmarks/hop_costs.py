@@ -69,7 +69,7 @@ def cpu_of_calls(hop: Any, call: Callable[[], Any], count: int = CALLS) -> tuple
 
 def measured_costs(config: RunConfig) -> Costs:
     """Costs of all hops, each by itself."""
-    bare = {"worker": worker_work(config), "learner": learner_work(config)}
+    bare = {"worker": worker_work(config, 6), "learner": learner_work(config)}
     found = timed_rates({name: stopwatch(one, time.process_time) for name, one in bare.items()}, ROUNDS)
     shape, rows = env_shape(config.env), config.batch_size * config.updates_per_call
     learner, worker = Learner(learner_settings(config, shape)), RolloutWorker(rollout_settings(config), 0, 0)

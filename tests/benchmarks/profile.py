@@ -1,5 +1,6 @@
 """Where the CPU time of a training over Ray goes: py-spy's samples of its processes, sorted by what they are for."""
 
+import dataclasses
 import subprocess
 import sys
 import sysconfig
@@ -18,19 +19,23 @@ from rich.table import Table
 from learner.config import RunConfig
 from tests.benchmarks.processes import processes_of_the_run
 from tests.benchmarks.ray_service import ENDLESS, WARM_S, ray_service
+from tests.benchmarks.service import SAMPLES_PER_INSERT
 from tests.checkpointing import Silent
 
 SECONDS, RATE_HZ = 30, 100
 SPY = Path(sysconfig.get_path("scripts")) / "py-spy"
 PARTS = ("driver", "rollout worker", "learner")
 RAY = "Ray"
+Shares = dict[tuple[str, str], float]
+"""Of each process and work, the share of all CPU time."""
 Samples = dict[int, Counter[str]]
 """Of each thread, by its id, how often it was seen at what."""
+REPLAY = ("replay", "prioritised", "sum_tree", "packing", "frame_ring", "ring_snapshot", "shard_node")
 WORK = (
     ("simulation", ("sim_core/",)),
     ("policy", ("actors/network.py", "actors/perceptron.py", "actors/exploration.py")),
     ("updates", ("learner/compiled.py", "learner/learner.py", "learner/updates.py", "learner/double_dqn.py")),
-    ("replay", ("actors/replay.py", "actors/prioritised.py", "actors/sum_tree.py", "actors/shard_node.py")),
+    ("replay", tuple(f"actors/{name}.py" for name in REPLAY)),
     ("transitions and blocks", ("actors/rollout.py", "actors/nstep.py", "actors/vector_env.py")),
     ("training loop", ("learner/", "actors/", "tests/")),
     (RAY, ("ray/", "<frozen")),
@@ -109,7 +114,7 @@ class Spy(threading.Thread):
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
-        self.shares: dict[tuple[str, str], float] = {}
+        self.shares: Shares = {}
         self.trouble = ""
 
     def run(self) -> None:
@@ -129,9 +134,10 @@ class Spy(threading.Thread):
         self.shares = {part: value / spent.total() for part, value in spent.most_common()}
 
 
-def main() -> None:
+def shares_of(config: RunConfig) -> Shares:
+    """Shares of the CPU time of a training, by process and work, the largest first."""
     spy = Spy()
-    with ray_service(RunConfig(**ENDLESS)) as make_loop:
+    with ray_service(config) as make_loop:
 
         def stop() -> bool:
             if loop.updates and spy.ident is None:
@@ -142,10 +148,21 @@ def main() -> None:
         loop.run()
     if spy.trouble:
         sys.exit(spy.trouble)
+    return spy.shares
+
+
+def main() -> None:
+    found = [
+        shares_of(dataclasses.replace(RunConfig(**ENDLESS), samples_per_insert=samples))
+        for samples in SAMPLES_PER_INSERT
+    ]
     table = Table(title="CPU time of a training of 10r×2g M_sensor, one rollout worker and learner")
-    for column, justify in (("process", "left"), ("what it does", "left"), ("share", "right")):
-        table.add_column(column, justify=justify)
-    for (kind, work), share in spy.shares.items():
-        if share >= 0.005:
-            table.add_row(kind, work, f"{share:.1%}")
+    for column in ("process", "what it does"):
+        table.add_column(column)
+    for samples in SAMPLES_PER_INSERT:
+        table.add_column(f"{samples:g} samples per insert", justify="right")
+    for part in found[0]:
+        shares = [of_run.get(part, 0.0) for of_run in found]
+        if max(shares) >= 0.005:
+            table.add_row(*part, *(f"{share:.1%}" for share in shares))
     Console(width=120).print(table)
