@@ -86,45 +86,59 @@ def count_frames(rows: NDArray[Any]) -> int:
     return int(np.count_nonzero(rows["next_row"] <= 0))
 
 
-def unpack(slots: NDArray[np.int64], rows: NDArray[Any], frames: NDArray[Any], into: np.dtype[Any]) -> NDArray[Any]:
-    """Whole transitions.
+def unpack(slots: NDArray[np.int64], rows: NDArray[Any], frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Columns of whole transitions, by the names of `actors.transitions.transition_dtype`, `[count, ...]` each.
 
     Args:
       slots: which rows `[count]`.
       rows: a ring of packed rows.
       frames: frame k stands at k modulo their number, a power of 2.
-      into: the transitions' layout (`actors.transitions.transition_dtype`).
     """
-    out: NDArray[Any] = np.zeros(len(slots), into)  # padding too: it travels, and is compared
-    packed, fields = rows.dtype.fields, into.fields
-    assert packed is not None and fields is not None
-    assert all(packed[name][1] == fields[name][1] < packed["next_row"][1] for name in ("reward", "discount", "action"))
-    places = (packed["next_row"][1], packed["observation"][1], fields["observation"][1], fields["next_observation"][1])
-    _unpack(slots, as_bytes(rows), rows["next_row"], as_bytes(frames), places, as_bytes(out))
-    return out
+    observation, fields, count = rows.dtype["observation"], rows.dtype.fields, len(slots)
+    assert fields is not None
+    reward, discount, action = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.int32)
+    seen, reached = np.empty((2, count, *observation.shape), observation.base)
+    place = fields["observation"][1]
+    ring = _Ring(rows["reward"], rows["discount"], rows["action"], rows["next_row"], as_bytes(rows), place)
+    _unpack(slots, ring, as_bytes(frames), _Drawn(reward, discount, action, as_bytes(seen), as_bytes(reached)))
+    columns = {"reward": reward, "discount": discount, "action": action}
+    return {**columns, "observation": seen, "next_observation": reached}
+
+
+class _Ring(NamedTuple):
+    """The fields of packed rows, the rows as bytes `[rows, bytes]`, and where in these the observation begins."""
+
+    reward: NDArray[np.float32]
+    discount: NDArray[np.float32]
+    action: NDArray[np.int32]
+    next_row: NDArray[np.int32]
+    memory: NDArray[np.uint8]
+    place: int
+
+
+class _Drawn(NamedTuple):
+    """Columns of whole transitions, observations as bytes."""
+
+    reward: NDArray[np.float32]
+    discount: NDArray[np.float32]
+    action: NDArray[np.int32]
+    observation: NDArray[np.uint8]
+    next_observation: NDArray[np.uint8]
 
 
 @kernel
-def _unpack(
-    slots: NDArray[np.int64],
-    rows: NDArray[np.uint8],
-    next_row: NDArray[np.int32],
-    frames: NDArray[np.uint8],
-    places: tuple[int, int, int, int],
-    out: NDArray[np.uint8],
-) -> None:
-    """`places`: where a packed row's `next_row` and observation begin, and a whole one's two observations."""
-    head, seen, seen_out, reached_out = places
-    capacity, mask, size = len(rows), len(frames) - 1, frames.shape[1]
+def _unpack(slots: NDArray[np.int64], rows: _Ring, frames: NDArray[np.uint8], out: _Drawn) -> None:
+    capacity, mask, begin = len(rows.memory), len(frames) - 1, rows.place
+    end = begin + frames.shape[1]
     for i in range(len(slots)):
-        row = rows[slots[i]]
-        copy_bytes(row[:head], out[i], 0)
-        copy_bytes(row[seen : seen + size], out[i], seen_out)
-        ahead = next_row[slots[i]]
+        slot = slots[i]
+        out.reward[i], out.discount[i], out.action[i] = rows.reward[slot], rows.discount[slot], rows.action[slot]
+        copy_bytes(rows.memory[slot, begin:end], out.observation[i], 0)
+        ahead = rows.next_row[slot]
         if ahead > 0:
-            copy_bytes(rows[(slots[i] + ahead) % capacity][seen : seen + size], out[i], reached_out)
+            copy_bytes(rows.memory[(slot + ahead) % capacity, begin:end], out.next_observation[i], 0)
         else:
-            copy_bytes(frames[-ahead & mask], out[i], reached_out)
+            copy_bytes(frames[-ahead & mask], out.next_observation[i], 0)
 
 
 @inlined

@@ -65,7 +65,6 @@ class ReplayShard:
     """
 
     def __init__(self, dtype: np.dtype[Any], capacity: int, seed: int) -> None:
-        self._dtype = dtype
         self._rows = np.zeros(capacity, packed_dtype(dtype))
         self._frames = FrameRing(dtype["observation"])
         self._next = 0
@@ -162,8 +161,8 @@ class ReplayShard:
         if self._size == 0:
             raise ValueError("an empty replay shard cannot be sampled")
 
-    def _take(self, slots: NDArray[np.int64]) -> NDArray[Any]:
-        return unpack(slots, self._rows, self._frames.frames, self._dtype)
+    def _take(self, slots: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        return unpack(slots, self._rows, self._frames.frames)
 
     def get_state(self) -> dict[str, Any]:
         """Counters and random stream, for JSON; rows and frames are in `snapshot`."""
@@ -197,7 +196,7 @@ class ReplayShard:
         capacity = len(self._rows)
         if state["next"] != (len(rows) if len(rows) < capacity else state["next"] % capacity):
             raise ValueError(f"{path} is the ring of a shard with another capacity than {capacity}")
-        frames = FrameRing(self._dtype["observation"])
+        frames = FrameRing(self._rows.dtype["observation"])
         frames.load(path / FRAMES, state["frames"], at_most=capacity)
         if not leads(np.roll(rows["next_row"], -state["next"]), frames.numbers):
             raise ValueError(f"{path} has rows that lead to observations which it does not hold")

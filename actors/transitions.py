@@ -132,12 +132,13 @@ class Draws(NamedTuple):
 
 
 class SampleReply(NamedTuple):
-    """Rows drawn from a shard `[count]`, and what the shard counts among all (see ReplayShard.mass).
+    """Transitions drawn from a shard, and what the shard counts among all (see ReplayShard.mass).
 
-    `draws` tells how they were drawn, None where all rows are drawn alike.
+    `columns` are theirs, `[count, ...]` each, by the names of `transition_dtype`; `draws` tells how they were drawn,
+    None where all are drawn alike.
     """
 
-    rows: NDArray[Any]
+    columns: dict[str, NDArray[Any]]
     mass: float
     draws: Draws | None
 

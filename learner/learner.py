@@ -15,6 +15,10 @@ from learner.gradients import FlatNetwork
 from learner.updates import LearnerSettings, TorchUpdates, Updates, UpdateStats
 from sim_core.checks import require
 
+NAMES = ("reward", "discount", "action", "observation", "next_observation")
+Rows = NDArray[Any] | dict[str, NDArray[Any]]
+"""Transitions, as rows of `actors.transitions.transition_dtype` or as their columns by name."""
+
 
 class Learner:
     """Owns the networks and changes them; every update is one gradient step of one minibatch.
@@ -47,13 +51,11 @@ class Learner:
         self._columns = Columns()
         self.td_errors = np.zeros(0, np.float32)
 
-    def update(
-        self, rows: NDArray[Any], learning_rate: float, weights: NDArray[np.float32] | None = None
-    ) -> UpdateStats:
+    def update(self, rows: Rows, learning_rate: float, weights: NDArray[np.float32] | None = None) -> UpdateStats:
         """One update per `batch_size` rows of `rows`, a whole multiple of it.
 
         Args:
-          rows: packed transitions.
+          rows: transitions (see Rows).
           learning_rate: Adam's.
           weights: what each row's loss counts, `[rows]`, None for 1.
         """
@@ -61,7 +63,7 @@ class Learner:
         if weights is not None:
             columns["weight"] = torch.from_numpy(weights)
         stats, self.td_errors = self._updates_of(columns, learning_rate, self.updates)
-        self.updates += len(rows) // self._batch_size
+        self.updates += len(self.td_errors) // self._batch_size
         return stats
 
     def weights(self, time_s: float) -> WeightsSnapshot:
@@ -115,7 +117,7 @@ def _part(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 class Columns:
-    """Columns of packed rows as tensors: observations, rewards and discounts float32, actions int64.
+    """Columns of transitions as tensors: observations, rewards and discounts float32, actions int64.
 
     Calls with as many rows share their memory: the tensors of one are overwritten by the next. A super-batch is
     megabytes, and to give memory back and take it anew with every call costs more than what is written to it.
@@ -124,10 +126,10 @@ class Columns:
     def __init__(self) -> None:
         self._tensors: dict[str, Tensor] = {}
 
-    def __call__(self, rows: NDArray[Any]) -> dict[str, Tensor]:
+    def __call__(self, rows: Rows) -> dict[str, Tensor]:
         """The columns of `rows`, `[count, ...]` each."""
-        if not self._tensors or len(self._tensors["action"]) != len(rows):
-            dtypes = {name: torch.int64 if name == "action" else torch.float32 for name in rows.dtype.names or ()}
+        if not self._tensors or len(self._tensors["action"]) != len(rows["action"]):
+            dtypes = {name: torch.int64 if name == "action" else torch.float32 for name in NAMES}
             self._tensors = {name: torch.empty(rows[name].shape, dtype=dtype) for name, dtype in dtypes.items()}
         for name, tensor in self._tensors.items():
             np.copyto(tensor.numpy(), rows[name], casting="unsafe")

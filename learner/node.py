@@ -42,13 +42,13 @@ class UpdateReport(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """A super-batch: rows `[count]`, and of prioritised ones also how they were drawn.
+    """A super-batch: columns of transitions `[count, ...]`, and of prioritised ones also how they were drawn.
 
     `shard` `[count]` is the shard that each came from, None where there is one; `draws.probability` is among the rows
     of all shards.
     """
 
-    rows: NDArray[Any]
+    columns: dict[str, NDArray[Any]]
     shard: NDArray[np.int64] | None
     draws: Draws | None
 
@@ -124,7 +124,7 @@ class LearnerNode:
         self._watch.lap(SAMPLES)
         if sample.draws is not None:
             weights = importance_weights(sample.draws.probability, self._settings.batch_size, importance_exponent)
-        stats = self._learner.update(sample.rows, learning_rate, weights)
+        stats = self._learner.update(sample.columns, learning_rate, weights)
         self._watch.lap(UPDATES)
         if sample.draws is not None:
             self._answer(sample)
@@ -143,7 +143,7 @@ class LearnerNode:
         self._take_answers()
         if len(self._shards) == 1:
             reply: SampleReply = self._result(0, self._shard_calls.start(self._shards[0], "sample", count))
-            return Sample(reply.rows, None, reply.draws)
+            return Sample(reply.columns, None, reply.draws)
         if not self._masses.all():
             self._masses[:] = self._ask_all("mass")
         chances = self._masses / self._masses.sum()
@@ -153,13 +153,15 @@ class LearnerNode:
         replies = [self._result(i, ref) for i, ref in zip(asked.tolist(), refs, strict=True)]
         self._masses[asked] = [reply.mass for reply in replies]
         order = self._rng.permutation(count)
-        rows = np.concatenate([reply.rows for reply in replies])[order]
+        columns = {
+            name: np.concatenate([reply.columns[name] for reply in replies])[order] for name in replies[0].columns
+        }
         drawn = [(chances[i], reply.draws) for i, reply in zip(asked, replies, strict=True) if reply.draws is not None]
         if not drawn:
-            return Sample(rows, None, None)
+            return Sample(columns, None, None)
         number = np.concatenate([draws.number for _, draws in drawn])[order]
         probability = np.concatenate([chance * draws.probability for chance, draws in drawn])[order]
-        return Sample(rows, np.repeat(asked, shares[asked])[order], Draws(number, probability))
+        return Sample(columns, np.repeat(asked, shares[asked])[order], Draws(number, probability))
 
     def _answer(self, sample: Sample) -> None:
         """Sends the TD errors of the updates to the shards that their rows came from."""

@@ -1,8 +1,10 @@
 """Packed transitions from whole ones, and back, the plain way."""
 
 import numpy as np
+from gymnasium.spaces import Box
 
 from actors.packing import Packed, packed_dtype
+from actors.transitions import transition_dtype
 
 
 def pack(transitions, next_row=None):
@@ -21,6 +23,15 @@ def pack_as_collected(transitions, envs=64, n_step=3):
     ahead = np.full(len(transitions), envs * n_step)
     ahead[-envs * n_step :] = 0
     return pack(transitions, ahead)
+
+
+def as_rows(columns):
+    """Whole transitions of their columns."""
+    observation = columns["observation"]
+    transitions = np.zeros(len(observation), transition_dtype(Box(-9, 9, observation.shape[1:], observation.dtype)))
+    for name, column in columns.items():
+        transitions[name] = column
+    return transitions
 
 
 def unpack(packed, dtype):

@@ -13,7 +13,7 @@ from actors.stopwatch import Stopwatch
 from actors.transitions import Delivered, Dropped, transition_dtype
 from actors.vector_env import env_shape
 from tests.checkpointing import saved
-from tests.packed import unpack
+from tests.packed import as_rows, unpack
 
 NUM_ENVS, STEPS = 2, 8
 BLOCK = NUM_ENVS * STEPS
@@ -106,7 +106,7 @@ def test_what_is_stored_is_what_the_worker_collected(make_node, make_shard, sett
     report = make_node([shard]).collect(0.5)[0]
     block = twin.collect(0.5)
     assert report.header == block.header
-    drawn = shard.sample(500).rows
+    drawn = as_rows(shard.sample(500).columns)
     assert {row.tobytes() for row in drawn} == {row.tobytes() for row in unpack(block.packed, drawn.dtype)}
 
 

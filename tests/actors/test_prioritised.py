@@ -11,6 +11,7 @@ from scipy import stats
 from actors.prioritised import SMALLEST, PrioritisedShard, PrioritySettings
 from actors.replay import ReplayShard
 from tests.actors.test_replay import DTYPE, make_block
+from tests.packed import as_rows
 
 ALPHA = 0.6
 
@@ -49,7 +50,7 @@ def test_priorities_stay_with_their_rows(capacity, steps, seed):
                     largest = max(largest, oracle[number])
         if oracle:
             reply = shard.sample(5)
-            np.testing.assert_array_equal(reply.draws.number, reply.rows["action"])
+            np.testing.assert_array_equal(reply.draws.number, reply.columns["action"])
             shares = [oracle[number] / sum(oracle.values()) for number in reply.draws.number.tolist()]
             np.testing.assert_allclose(reply.draws.probability, shares, rtol=1e-12)
             assert reply.mass == pytest.approx(sum(oracle.values()), rel=1e-12)
@@ -67,18 +68,18 @@ def test_rows_are_drawn_in_proportion_to_their_tds_power(exponent):
     shares = (errors.astype(np.float64) + SMALLEST) ** exponent
     shares /= shares.sum()
     expected = 200_000 * shares
-    counts = np.bincount(drawn.rows["action"], minlength=70)
+    counts = np.bincount(drawn.columns["action"], minlength=70)
     assert not counts[:20].any()
     # Strata take a part of chance away, so that the statistic is below that of independent draws, never above.
     assert stats.chisquare(counts[20:], expected).pvalue > 1e-4
-    np.testing.assert_allclose(drawn.draws.probability, shares[drawn.rows["action"] - 20], rtol=1e-5)
+    np.testing.assert_allclose(drawn.draws.probability, shares[drawn.columns["action"] - 20], rtol=1e-5)
 
 
 def test_one_stratum_a_draw_is_independent_draws():
     shard = make_shard(4, strata=1)
     shard.add(make_block(range(4)))
     shard.set_priorities(np.arange(4), np.array([0.1, 1, 2, 3], np.float32))
-    drawn = shard.sample(40_000).rows["action"]
+    drawn = shard.sample(40_000).columns["action"]
     shares = shard.priorities / shard.priorities.sum()
     pairs = np.bincount(4 * drawn[:-1:2] + drawn[1::2], minlength=16)
     assert stats.chisquare(pairs, 20_000 * np.outer(shares, shares).ravel()).pvalue > 1e-4
@@ -100,7 +101,7 @@ def test_a_row_without_error_is_still_drawn_some_day():
     shard = make_shard(2, exponent=1.0)
     shard.add(make_block([0, 1]))
     shard.set_priorities(np.array([0, 1]), np.array([0, 0], np.float32))
-    assert set(shard.sample(200).rows["action"].tolist()) == {0, 1}
+    assert set(shard.sample(200).columns["action"].tolist()) == {0, 1}
 
 
 def test_overwritten_rows_are_left_out_and_counted():
@@ -170,9 +171,9 @@ def test_a_saved_shard_goes_on_bit_by_bit(tmp_path, inserted):
         for sequence in (5, 6):
             drawn = copy.sample(50)
             copy.add(make_block(range(200, 205), sequence, worker_id=2))
-            copy.set_priorities(drawn.draws.number, drawn.rows["reward"] / 7)
+            copy.set_priorities(drawn.draws.number, drawn.columns["reward"] / 7)
     one, two = shard.sample(50), resumed.sample(50)
-    np.testing.assert_array_equal(one.rows, two.rows)
+    np.testing.assert_array_equal(as_rows(one.columns), as_rows(two.columns))
     np.testing.assert_array_equal(one.draws, two.draws)
     assert one.mass == two.mass
     np.testing.assert_array_equal(shard.priorities, resumed.priorities)
@@ -188,7 +189,7 @@ def test_what_comes_after_the_snapshot_is_not_in_it(tmp_path):
     resumed.load(tmp_path / "later.zarr", state)
     expected.load(tmp_path / "shard.zarr", state)
     np.testing.assert_array_equal(resumed.priorities, before)
-    np.testing.assert_array_equal(resumed.sample(50).rows, expected.sample(50).rows)
+    np.testing.assert_array_equal(as_rows(resumed.sample(50).columns), as_rows(expected.sample(50).columns))
 
 
 def test_a_save_that_does_not_fit_is_refused(tmp_path):

@@ -52,9 +52,9 @@ class Hop:
         """Takes weights."""
         self._weights = weights
 
-    def give(self, count: int) -> np.ndarray:
-        """Rows that are drawn here."""
-        return self._shard.sample(count).rows
+    def give(self, count: int) -> dict[str, np.ndarray]:
+        """Columns of transitions that are drawn here."""
+        return self._shard.sample(count).columns
 
 
 def cpu_of_calls(hop: Any, call: Callable[[], Any], count: int = CALLS) -> tuple[float, float]:

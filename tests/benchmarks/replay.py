@@ -61,7 +61,7 @@ def shoal_rival(prioritised: bool) -> Rival:
 
     def draw(count: int) -> object:
         reply = shard.sample(count)
-        columns_of(reply.rows)
+        columns_of(reply.columns)
         if reply.draws is None:
             return None
         importance_weights(reply.draws.probability, BATCH, BETA)

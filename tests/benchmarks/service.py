@@ -57,10 +57,11 @@ def learner_work(config: RunConfig):
     learner = Learner(learner_settings(config, shape))
     rows = np.zeros(config.batch_size * config.updates_per_call, transition_dtype(shape.observation_space))
     rows["observation"] = np.random.default_rng(0).integers(-5, 5, rows["observation"].shape)
+    columns = {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}  # as a shard draws them
 
     def work() -> int:
         for _ in range(4):
-            learner.update(rows, config.learning_rate)
+            learner.update(columns, config.learning_rate)
         return 4 * config.updates_per_call
 
     return work

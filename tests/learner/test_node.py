@@ -18,7 +18,7 @@ from learner.double_dqn import importance_weights
 from learner.learner import Learner
 from learner.node import LearnerNode
 from tests.checkpointing import saved
-from tests.packed import pack
+from tests.packed import as_rows, pack
 
 RATE = 1e-3
 
@@ -100,7 +100,7 @@ class ShardContract:
             assert node.add(make_block(make_rows(30, seed=sequence), sequence)).stored == 30
         assert shard.size() == 50
         newest = np.concatenate([make_rows(30, seed=sequence) for sequence in range(3)])[-50:]
-        assert {row.tobytes() for row in shard.sample(2000).rows} == {row.tobytes() for row in newest}
+        assert {row.tobytes() for row in as_rows(shard.sample(2000).columns)} == {row.tobytes() for row in newest}
 
     def test_refuses_another_schema(self, target, make_rows):
         node, shard, _ = target
@@ -181,7 +181,7 @@ def test_rows_of_all_shards_are_drawn_equally_often(make_learner, make_rows, siz
         rows = make_rows(size)
         rows["action"] = 1000 * number + np.arange(size)
         shard.add(make_block(rows))
-    drawn = np.concatenate([learner._sample(900).rows["action"] for _ in range(20)])
+    drawn = np.concatenate([learner._sample(900).columns["action"] for _ in range(20)])
     counts = [np.bincount(drawn[drawn // 1000 == i] % 1000, minlength=size) for i, size in enumerate(sizes)]
     assert stats.chisquare(np.concatenate(counts)).pvalue > 1e-4
 
@@ -192,7 +192,7 @@ def test_every_minibatch_mixes_the_shards(make_learner, make_rows):
         rows = make_rows(50)
         rows["action"] = number
         shard.add(make_block(rows))
-    means = learner._sample(64 * 16).rows["action"].reshape(64, 16).mean(axis=1)
+    means = learner._sample(64 * 16).columns["action"].reshape(64, 16).mean(axis=1)
     assert 0.1 < means.min() and means.max() < 0.9
 
 
@@ -288,7 +288,7 @@ def test_td_errors_go_back_to_the_rows_that_they_are_of(make_learner, make_rows,
     weights, sampled, real = learner.weights(), [], learner._sample
     learner._sample = lambda count: sampled.append(real(count)) or sampled[0]
     learner.update(1, RATE, 1.0)
-    drawn = {round(reward) for reward in sampled[0].rows["reward"].tolist()}
+    drawn = {round(reward) for reward in sampled[0].columns["reward"].tolist()}
     assert 1 < len(drawn) <= 16
     for i, (shard, size) in enumerate(zip(shards, sizes, strict=True)):
         rows = numbered(make_rows, size, 1000 * i)
@@ -304,13 +304,13 @@ def test_rows_of_all_shards_are_drawn_in_proportion_to_their_priorities(make_lea
     for i, (shard, size) in enumerate(zip(shards, sizes, strict=True)):
         shard.set_priorities(np.arange(size), np.linspace(0.1, 2 + i, size, dtype=np.float32) ** 2)
     samples = [learner._sample(1600) for _ in range(20)]
-    drawn = np.concatenate([sample.rows["reward"] for sample in samples]).astype(int)
+    drawn = np.concatenate([sample.columns["reward"] for sample in samples]).astype(int)
     priorities = [shard.shard.priorities for shard in shards]
     shares = [part / np.concatenate(priorities).sum() for part in priorities]
     counts = [np.bincount(drawn[drawn // 1000 == i] % 1000, minlength=size) for i, size in enumerate(sizes)]
     assert stats.chisquare(np.concatenate(counts), len(drawn) * np.concatenate(shares)).pvalue > 1e-4
     for sample in samples:
-        numbers = sample.rows["reward"].astype(int)
+        numbers = sample.columns["reward"].astype(int)
         expected = [shares[number // 1000][number % 1000] for number in numbers]
         np.testing.assert_allclose(sample.draws.probability, expected, rtol=1e-9)
         np.testing.assert_array_equal(sample.draws.number, numbers % 1000)
@@ -329,7 +329,7 @@ def test_updates_count_their_rows_by_importance(make_learner, make_rows, learner
     plain = Learner(learner_settings)
     sample = other.sample(3 * 16)
     probability = other.shard.priorities[sample.draws.number] / other.shard.priorities.sum()
-    plain.update(sample.rows, RATE, importance_weights(probability, 16, exponent))
+    plain.update(sample.columns, RATE, importance_weights(probability, 16, exponent))
     for array, expected in zip(learner.weights().arrays, plain.weights(0.0).arrays, strict=True):
         np.testing.assert_array_equal(array, expected)
 
