@@ -7,6 +7,7 @@ of steps that come with a later block, are kept beside the rows, as frames.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,7 +60,7 @@ def frames_of(transitions: int, steps_per_block: int, n_step: int) -> int:
 
 def as_bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
     """An array's entries as bytes `[len(array), bytes]`, the same memory where it is contiguous."""
-    size = array.dtype.itemsize * int(np.prod(array.shape[1:]))
+    size = array.dtype.itemsize * math.prod(array.shape[1:])
     return np.ascontiguousarray(array).view(np.uint8).reshape(len(array), size)
 
 
@@ -86,25 +87,6 @@ def count_frames(rows: NDArray[Any]) -> int:
     return int(np.count_nonzero(rows["next_row"] <= 0))
 
 
-def unpack(slots: NDArray[np.int64], rows: NDArray[Any], frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """Columns of whole transitions, by the names of `actors.transitions.transition_dtype`, `[count, ...]` each.
-
-    Args:
-      slots: which rows `[count]`.
-      rows: a ring of packed rows.
-      frames: frame k stands at k modulo their number, a power of 2.
-    """
-    observation, fields, count = rows.dtype["observation"], rows.dtype.fields, len(slots)
-    assert fields is not None
-    reward, discount, action = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.int32)
-    seen, reached = np.empty((2, count, *observation.shape), observation.base)
-    place = fields["observation"][1]
-    ring = _Ring(rows["reward"], rows["discount"], rows["action"], rows["next_row"], as_bytes(rows), place)
-    _unpack(slots, ring, as_bytes(frames), _Drawn(reward, discount, action, as_bytes(seen), as_bytes(reached)))
-    columns = {"reward": reward, "discount": discount, "action": action}
-    return {**columns, "observation": seen, "next_observation": reached}
-
-
 class _Ring(NamedTuple):
     """The fields of packed rows, the rows as bytes `[rows, bytes]`, and where in these the observation begins."""
 
@@ -124,6 +106,36 @@ class _Drawn(NamedTuple):
     action: NDArray[np.int32]
     observation: NDArray[np.uint8]
     next_observation: NDArray[np.uint8]
+
+
+class Unpacker:
+    """Makes whole transitions of a ring of packed rows.
+
+    Args:
+      rows: the ring, whose memory is looked at in every call.
+    """
+
+    def __init__(self, rows: NDArray[Any]) -> None:
+        fields, observation = rows.dtype.fields, rows.dtype["observation"]
+        assert fields is not None
+        place = fields["observation"][1]
+        self._ring = _Ring(rows["reward"], rows["discount"], rows["action"], rows["next_row"], as_bytes(rows), place)
+        self._shape, self._dtype = observation.shape, observation.base
+
+    def __call__(self, slots: NDArray[np.int64], frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """Columns of whole transitions, by the names of `actors.transitions.transition_dtype`, `[count, ...]` each.
+
+        Args:
+          slots: which rows `[count]`.
+          frames: frame k stands at k modulo their number, a power of 2.
+        """
+        count = len(slots)
+        reward, discount, action = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.int32)
+        seen, reached = np.empty((2, count, *self._shape), self._dtype)
+        drawn = _Drawn(reward, discount, action, as_bytes(seen), as_bytes(reached))
+        _unpack(slots, self._ring, as_bytes(frames), drawn)
+        columns = {"reward": reward, "discount": discount, "action": action}
+        return {**columns, "observation": seen, "next_observation": reached}
 
 
 @kernel

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.frame_ring import FrameRing
-from actors.packing import Packed, as_bytes, count_frames, leads, packed_dtype, renumber, unpack
+from actors.packing import Packed, Unpacker, as_bytes, count_frames, leads, packed_dtype, renumber
 from actors.ring_snapshot import RingSnapshot
 from actors.storage import load_rows, save_rows
 from actors.transitions import SCHEMA_VERSION, BlockHeader, SampleReply, TransitionBlock
@@ -66,6 +66,7 @@ class ReplayShard:
 
     def __init__(self, dtype: np.dtype[Any], capacity: int, seed: int) -> None:
         self._rows = np.zeros(capacity, packed_dtype(dtype))
+        self._unpack = Unpacker(self._rows)
         self._frames = FrameRing(dtype["observation"])
         self._next = 0
         self._size = 0
@@ -162,7 +163,7 @@ class ReplayShard:
             raise ValueError("an empty replay shard cannot be sampled")
 
     def _take(self, slots: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-        return unpack(slots, self._rows, self._frames.frames)
+        return self._unpack(slots, self._frames.frames)
 
     def get_state(self) -> dict[str, Any]:
         """Counters and random stream, for JSON; rows and frames are in `snapshot`."""

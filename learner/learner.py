@@ -119,8 +119,9 @@ def _part(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 class Columns:
     """Columns of transitions as tensors: observations, rewards and discounts float32, actions int64.
 
-    Calls with as many rows share their memory: the tensors of one are overwritten by the next. A super-batch is
-    megabytes, and to give memory back and take it anew with every call costs more than what is written to it.
+    A column that is so already is taken as it is. The others are written to memory that calls with as many rows share,
+    so that the tensors of one are overwritten by the next: a super-batch is megabytes, and to give memory back and take
+    it anew with every call costs more than what is written to it.
     """
 
     def __init__(self) -> None:
@@ -128,9 +129,14 @@ class Columns:
 
     def __call__(self, rows: Rows) -> dict[str, Tensor]:
         """The columns of `rows`, `[count, ...]` each."""
-        if not self._tensors or len(self._tensors["action"]) != len(rows["action"]):
-            dtypes = {name: torch.int64 if name == "action" else torch.float32 for name in NAMES}
-            self._tensors = {name: torch.empty(rows[name].shape, dtype=dtype) for name, dtype in dtypes.items()}
-        for name, tensor in self._tensors.items():
-            np.copyto(tensor.numpy(), rows[name], casting="unsafe")
-        return dict(self._tensors)
+        return {name: self._column(name, rows[name]) for name in NAMES}
+
+    def _column(self, name: str, column: NDArray[Any]) -> Tensor:
+        wanted = np.int64 if name == "action" else np.float32
+        if column.dtype == wanted and column.flags.c_contiguous and column.flags.writeable:
+            return torch.from_numpy(column)
+        tensor = self._tensors.get(name)
+        if tensor is None or tensor.shape != column.shape:
+            tensor = self._tensors[name] = torch.from_numpy(np.empty(column.shape, wanted))
+        np.copyto(tensor.numpy(), column, casting="unsafe")
+        return tensor

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from typing import Any
 
+import psutil
 import ray
 from ray.actor import ActorHandle
 from ray.exceptions import (
@@ -49,6 +51,8 @@ UPDATES_IN_FLIGHT = 2
 """Calls of updates that are started ahead, so that the learner never waits for the driver."""
 INNER_SHARE = 0.3
 """Share of the deadline that parts give each other, so that one that waits, twice in a row, is not itself late."""
+RAYLET = "raylet"
+"""Name of the process that a Ray of our own starts its workers from."""
 FAULTS: tuple[tuple[tuple[type[Exception], ...], Fault], ...] = (
     ((ActorUnavailableError,), Fault.UNREACHABLE),
     ((RayActorError, WorkerCrashedError, NodeDiedError, OutOfMemoryError, TaskCancelledError), Fault.DIED),
@@ -195,11 +199,24 @@ def connect(cpus: int, address: str | None) -> None:
         ) from error
     have = cluster_cpus()
     if have < cpus:
-        ray.shutdown()
+        leave()
         raise ConfigError(
             f"the run needs {cpus} CPUs (one a rollout worker, shard actor and learner), the cluster has {have}: "
             "lower workers or replay_shards, or add nodes"
         )
+
+
+def leave() -> None:
+    """Leaves the cluster; a Ray of our own ends with all of its processes.
+
+    A worker of Ray may hang for good in its own end, after its raylet has gone, and Ray looks after it no more.
+    """
+    raylets = [child for child in psutil.Process().children() if child.name() == RAYLET]
+    family = [process for raylet in raylets for process in raylet.children(recursive=True)]
+    ray.shutdown()
+    for process in family:
+        with suppress(psutil.NoSuchProcess):
+            process.kill()
 
 
 def evaluate_in_tasks(spec: EnvSpec, candidate: Candidate, seeds: list[int], address: str | None) -> EpisodeStats:
@@ -213,7 +230,7 @@ def evaluate_in_tasks(spec: EnvSpec, candidate: Candidate, seeds: list[int], add
     try:
         return evaluate_in_parts(calls, spec, calls.put(candidate), seeds, cluster_cpus())
     finally:
-        ray.shutdown()
+        leave()
 
 
 def ray_cluster(config: RunConfig, incarnation: int, place: Place) -> Cluster:
@@ -257,7 +274,7 @@ def ray_cluster(config: RunConfig, incarnation: int, place: Place) -> Cluster:
         updates_in_flight=UPDATES_IN_FLIGHT,
         eval_tasks=cluster_cpus(),
         abandon=abandon,
-        close=ray.shutdown,
+        close=leave,
     )
 
 

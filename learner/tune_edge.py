@@ -14,11 +14,10 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, Protocol
 
-import ray
 from ray import tune
 
 from learner.journal import Row
-from learner.ray_edge import cluster_cpus, connect
+from learner.ray_edge import cluster_cpus, connect, leave
 from learner.ray_metrics import RayMetrics
 from learner.sweep import Cell, SweepConfig
 from learner.trial import SweepPlace, run_cell
@@ -149,4 +148,4 @@ def run_cells(
         )
         with redirect_stdout(io.StringIO()):  # the listener tells what Tune would print
             tuner.fit()
-    ray.shutdown()
+    leave()

@@ -15,7 +15,7 @@ from actors.vector_env import env_shape
 from learner.cluster import learner_settings, rollout_settings, shard_settings
 from learner.config import RunConfig
 from learner.learner import Learner
-from learner.ray_edge import connect
+from learner.ray_edge import connect, leave
 from tests.benchmarks.service import learner_work, worker_work
 from tests.benchmarks.service_model import Costs
 from tests.benchmarks.timing import spread, stopwatch, timed_rates
@@ -85,7 +85,7 @@ def measured_costs(config: RunConfig) -> Costs:
         send, receive = cpu_of_calls(hop, lambda: ray.get(hop.receive.remote(weights)))
         publish, _ = cpu_of_calls(hop, lambda: learner.weights(0.0))
     finally:
-        ray.shutdown()
+        leave()
     return Costs(
         env_step=1 / spread(found["worker"]).median,
         update=1 / spread(found["learner"]).median,

@@ -161,13 +161,31 @@ def test_columns_are_those_of_the_rows_whatever_was_there_before(make_rows):
             np.testing.assert_array_equal(column.numpy(), rows[name])
 
 
-def test_rows_are_left_as_they_are(learner_settings, make_rows):
-    """A call's tensors are memory of the learner, which a next call overwrites."""
-    learner, first, second = Learner(learner_settings), make_rows(32), make_rows(32, seed=1)
+def as_columns(rows):
+    """The rows' columns, as a shard draws them."""
+    return {name: rows[name].copy() for name in rows.dtype.names}
+
+
+@pytest.mark.parametrize("form", [np.copy, as_columns])
+def test_rows_are_left_as_they_are(learner_settings, make_rows, form):
+    """A call's tensors are memory of the learner, which a next call overwrites, or the caller's own."""
+    learner, first, second = Learner(learner_settings), form(make_rows(32)), form(make_rows(32, seed=1))
     learner.update(first, RATE)
     learner.update(second, RATE)
-    np.testing.assert_array_equal(first, make_rows(32))
-    np.testing.assert_array_equal(second, make_rows(32, seed=1))
+    for left, seed in ((first, 0), (second, 1)):
+        for name in make_rows(0).dtype.names:
+            np.testing.assert_array_equal(left[name], make_rows(32, seed=seed)[name])
+
+
+@pytest.mark.parametrize("gradients", ["by_hand", "autograd"])
+def test_rows_and_their_columns_teach_the_same(learner_settings, make_rows, gradients):
+    one, other = (Learner(learner_settings._replace(gradients=gradients)) for _ in range(2))
+    for seed in range(3):
+        one.update(make_rows(64, seed=seed), RATE)
+        other.update(as_columns(make_rows(64, seed=seed)), RATE)
+    assert one.updates == other.updates == 12
+    for a, b in zip(one.weights(0.0).arrays, other.weights(0.0).arrays, strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_weights_of_1_change_nothing(learner_settings, make_rows):

@@ -1,0 +1,47 @@
+"""A Ray of our own leaves nothing behind, not even a process that hangs in its own end."""
+
+import subprocess
+import sys
+
+import psutil
+import pytest
+
+pytestmark = pytest.mark.ray
+
+SCRIPT = """
+import atexit, os, time
+from learner.ray_auth import guard_ray
+guard_ray(joins=False)
+import ray
+from learner.ray_edge import connect, leave
+
+class Part:
+    def pid(self):
+        atexit.register(time.sleep, 600)
+        return os.getpid()
+
+connect(2, None)
+parts = [ray.remote(num_cpus=1)(Part).remote() for _ in range(2)]
+print(*ray.get([part.pid.remote() for part in parts]))
+del parts[0]  # Ray asks it to go, and takes it for gone
+time.sleep(2)
+leave()
+assert not ray.is_initialized()
+"""
+
+
+def has_gone(pid):
+    """Whether a process ends within ten seconds."""
+    try:
+        psutil.Process(pid).wait(timeout=10)
+    except psutil.TimeoutExpired:
+        return False
+    except psutil.NoSuchProcess:
+        pass
+    return True
+
+
+def test_a_process_that_hangs_does_not_outlive_our_own_ray():
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert [has_gone(int(pid)) for pid in done.stdout.split()] == [True, True]
