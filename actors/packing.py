@@ -18,6 +18,9 @@ from sim_core.jit import inlined, kernel
 NUMBERS = 2**31
 """Frames are known by their number among all that came, modulo this."""
 
+PART = 16
+"""Rows that are unpacked together: about as many reads as a core has under way at once."""
+
 
 class Packed(NamedTuple):
     """Transitions, oldest first.
@@ -133,24 +136,36 @@ class Unpacker:
         reward, discount, action = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.int32)
         seen, reached = np.empty((2, count, *self._shape), self._dtype)
         drawn = _Drawn(reward, discount, action, as_bytes(seen), as_bytes(reached))
-        _unpack(slots, self._ring, as_bytes(frames), drawn)
+        _unpack(slots, self._ring, as_bytes(frames), drawn, np.empty(PART, np.int64))
         columns = {"reward": reward, "discount": discount, "action": action}
         return {**columns, "observation": seen, "next_observation": reached}
 
 
 @kernel
-def _unpack(slots: NDArray[np.int64], rows: _Ring, frames: NDArray[np.uint8], out: _Drawn) -> None:
+def _unpack(
+    slots: NDArray[np.int64], rows: _Ring, frames: NDArray[np.uint8], out: _Drawn, reached: NDArray[np.int64]
+) -> None:
+    """Part after part of the slots, of the length of `reached`, whose reads are under way at once."""
     capacity, mask, begin = len(rows.memory), len(frames) - 1, rows.place
     end = begin + frames.shape[1]
-    for i in range(len(slots)):
-        slot = slots[i]
-        out.reward[i], out.discount[i], out.action[i] = rows.reward[slot], rows.discount[slot], rows.action[slot]
-        copy_bytes(rows.memory[slot, begin:end], out.observation[i], 0)
-        ahead = rows.next_row[slot]
-        if ahead > 0:
-            copy_bytes(rows.memory[(slot + ahead) % capacity, begin:end], out.next_observation[i], 0)
-        else:
-            copy_bytes(frames[-ahead & mask], out.next_observation[i], 0)
+    for start in range(0, len(slots), len(reached)):
+        part = range(min(len(reached), len(slots) - start))
+        for i in part:
+            slot, ahead = slots[start + i], rows.next_row[slots[start + i]]
+            reached[i] = (slot + ahead) % capacity if ahead > 0 else -1 - (-ahead & mask)
+            out.reward[start + i], out.discount[start + i] = rows.reward[slot], rows.discount[slot]
+            out.action[start + i] = rows.action[slot]
+        if begin < end:
+            for i in part:
+                place = reached[i]
+                out.next_observation[start + i, 0] = rows.memory[place, begin] if place >= 0 else frames[-1 - place, 0]
+        for i in part:
+            place = reached[i]
+            copy_bytes(rows.memory[slots[start + i], begin:end], out.observation[start + i], 0)
+            if place >= 0:
+                copy_bytes(rows.memory[place, begin:end], out.next_observation[start + i], 0)
+            else:
+                copy_bytes(frames[-1 - place], out.next_observation[start + i], 0)
 
 
 @inlined
