@@ -19,8 +19,8 @@ def number(text: str) -> float:
 
 
 def benchmark(row: str, column: int) -> float:
-    """A number of the README's benchmark tables: the first in the column of the row that begins so."""
-    (line,) = [line for line in MEASURED.splitlines() if line.startswith("│") and row in line]
+    """A number of the README's benchmark tables: the first in the column of the first row that has this text."""
+    line = next(line for line in MEASURED.splitlines() if line.startswith("│") and row in line)
     return number(re.search(r"[\d,.]+", line.split("│")[column])[0])
 
 
