@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.packing import Packed, as_bytes, copy_bytes
+from actors.packing import Fields, Packed, as_bytes, copy_bytes, fields_of
 from sim_core.jit import inlined, kernel
 
 
@@ -84,17 +84,13 @@ class NStepAssembler:
         shape = window.done.shape
         rows = np.zeros(window.done.size, self._dtype)
         frames = np.empty((len(rows), *window.reached.shape[2:]), window.reached.dtype)
-        written = _Rows(
-            rows["reward"], rows["discount"], rows["action"], rows["next_row"], as_bytes(rows), as_bytes(frames)
-        )
         columns = _Columns(
             _steps_as_bytes(window.observation), _steps_as_bytes(window.reached), *window[1:3], *window[4:]
         )
         begun = _Begun(np.full(shape, -1), np.empty(len(rows), np.int64))
-        waits, fields = np.zeros_like(self._waits), self._dtype.fields
-        assert fields is not None
-        count = _assemble(columns, self._waits, self._powers, written, fields["observation"][1], waits, begun)
-        kept = _link(columns, written, begun)
+        waits, fields = np.zeros_like(self._waits), fields_of(rows)
+        count = _assemble(columns, self._waits, self._powers, fields, waits, begun)
+        kept = _link(columns, fields, as_bytes(frames), begun)
         return Packed(rows[:count], frames[:kept].copy()), waits
 
     def _after_the_kept(self, steps: Steps) -> Steps:
@@ -129,17 +125,6 @@ class _Columns(NamedTuple):
     done: NDArray[np.bool_]
 
 
-class _Rows(NamedTuple):
-    """The fields of packed rows; rows and frames as bytes `[rows, bytes]`."""
-
-    reward: NDArray[np.float32]
-    discount: NDArray[np.float32]
-    action: NDArray[np.int32]
-    next_row: NDArray[np.int32]
-    memory: NDArray[np.uint8]
-    frames: NDArray[np.uint8]
-
-
 class _Begun(NamedTuple):
     """Of every env step `[steps, num_envs]` the row that begins with it, -1 for none; of every row its last step."""
 
@@ -156,15 +141,13 @@ def _assemble(
     steps: _Columns,
     waited: NDArray[np.bool_],
     powers: NDArray[np.float64],
-    rows: _Rows,
-    place: int,
+    rows: Fields,
     waits: NDArray[np.bool_],
     begun: _Begun,
 ) -> int:
     """Writes the transitions that are complete to `rows`, and to `waits` which of the last steps are not.
 
-    Of the first steps only those that `waited` begin a transition. `powers` are gamma's up to the n-th, `place` the
-    byte at which a row's observation begins.
+    Of the first steps only those that `waited` begin a transition. `powers` are gamma's up to the n-th.
     """
     total, num_envs = steps.done.shape
     kept, count = len(waits), 0
@@ -179,7 +162,7 @@ def _assemble(
             rows.reward[count] = value
             rows.discount[count] = 0.0 if steps.terminated[last, env] and ended else powers[last + 1 - step]
             rows.action[count] = steps.action[step, env]
-            copy_bytes(steps.observation[step, env], rows.memory[count], place)
+            copy_bytes(steps.observation[step, env], rows.memory[count], rows.place)
             begun.row[step, env] = count
             begun.last[count] = last
             count += 1
@@ -187,8 +170,8 @@ def _assemble(
 
 
 @kernel
-def _link(steps: _Columns, rows: _Rows, begun: _Begun) -> int:
-    """Writes `next_row`, and the frames that it takes; returns how many these are."""
+def _link(steps: _Columns, rows: Fields, frames: NDArray[np.uint8], begun: _Begun) -> int:
+    """Writes `next_row`, and to `frames` those that it takes; returns how many these are."""
     total, num_envs = steps.done.shape
     count = 0
     for step in range(total):
@@ -204,7 +187,7 @@ def _link(steps: _Columns, rows: _Rows, begun: _Begun) -> int:
                 rows.next_row[row] = after - row
             else:
                 rows.next_row[row] = -count
-                copy_bytes(steps.reached[last, env], rows.frames[count], 0)
+                copy_bytes(steps.reached[last, env], frames[count], 0)
                 count += 1
     return count
 

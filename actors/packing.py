@@ -90,7 +90,7 @@ def count_frames(rows: NDArray[Any]) -> int:
     return int(np.count_nonzero(rows["next_row"] <= 0))
 
 
-class _Ring(NamedTuple):
+class Fields(NamedTuple):
     """The fields of packed rows, the rows as bytes `[rows, bytes]`, and where in these the observation begins."""
 
     reward: NDArray[np.float32]
@@ -99,6 +99,14 @@ class _Ring(NamedTuple):
     next_row: NDArray[np.int32]
     memory: NDArray[np.uint8]
     place: int
+
+
+def fields_of(rows: NDArray[Any]) -> Fields:
+    """Views of packed rows, for kernels: the same types whatever is observed."""
+    fields = rows.dtype.fields
+    assert fields is not None
+    place = fields["observation"][1]
+    return Fields(rows["reward"], rows["discount"], rows["action"], rows["next_row"], as_bytes(rows), place)
 
 
 class _Drawn(NamedTuple):
@@ -119,10 +127,8 @@ class Unpacker:
     """
 
     def __init__(self, rows: NDArray[Any]) -> None:
-        fields, observation = rows.dtype.fields, rows.dtype["observation"]
-        assert fields is not None
-        place = fields["observation"][1]
-        self._ring = _Ring(rows["reward"], rows["discount"], rows["action"], rows["next_row"], as_bytes(rows), place)
+        observation = rows.dtype["observation"]
+        self._ring = fields_of(rows)
         self._shape, self._dtype = observation.shape, observation.base
 
     def __call__(self, slots: NDArray[np.int64], frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
@@ -143,7 +149,7 @@ class Unpacker:
 
 @kernel
 def _unpack(
-    slots: NDArray[np.int64], rows: _Ring, frames: NDArray[np.uint8], out: _Drawn, reached: NDArray[np.int64]
+    slots: NDArray[np.int64], rows: Fields, frames: NDArray[np.uint8], out: _Drawn, reached: NDArray[np.int64]
 ) -> None:
     """Part after part of the slots, of the length of `reached`, whose reads are under way at once."""
     capacity, mask, begin = len(rows.memory), len(frames) - 1, rows.place
