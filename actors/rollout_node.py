@@ -173,9 +173,9 @@ class RolloutNode:
         self._writer.start(location, lambda path: save_file(state["arrays"], str(path)))
         return {**state["meta"], "next_shard": self._next_shard}
 
-    def saved(self) -> Written | None:
-        """How the last `save` ended; None while it is being written."""
-        return self._writer.result()
+    def saved(self, timeout_s: float = 0.0) -> Written | None:
+        """How the last `save` ended; None while it is still being written after `timeout_s`."""
+        return self._writer.result(timeout_s)
 
     def load(self, location: Location, state: dict[str, Any]) -> None:
         """Takes up what `save` wrote and returned.

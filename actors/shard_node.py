@@ -117,9 +117,9 @@ class ShardNode:
             snapshot.close()
         return self.shard.get_state()
 
-    def saved(self) -> Written | None:
-        """How the last `save` ended; None while it is being written."""
-        return self._writer.result()
+    def saved(self, timeout_s: float = 0.0) -> Written | None:
+        """How the last `save` ended; None while it is still being written after `timeout_s`."""
+        return self._writer.result(timeout_s)
 
     def load(self, location: Location, state: dict[str, Any]) -> None:
         """Takes up what `save` wrote and returned (see ReplayShard.load)."""

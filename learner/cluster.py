@@ -19,6 +19,9 @@ from learner.config import RunConfig
 from learner.node import LearnerNode
 from learner.updates import LearnerSettings
 
+LAST_WRITE_S = 60.0
+"""How long parts of this process may go on writing after an error; a disk that hangs must not hide it."""
+
 
 class Cluster(NamedTuple):
     """Nodes of a run, how to replace them, and how many calls each may have under way.
@@ -27,7 +30,7 @@ class Cluster(NamedTuple):
     `place_shard` take an index and an incarnation; `discard` ends a node or a call. A part that is silent for
     `deadline_s` is late, one that has not answered yet for `start_deadline_s`. `collects_in_flight` counts
     collects per worker, `updates_in_flight` calls of updates, `eval_tasks` the tasks of one final evaluation.
-    `abandon` ends all parts, `close` frees everything.
+    `abandon` ends all parts and what they write, `close` frees everything.
     """
 
     calls: Calls
@@ -114,11 +117,17 @@ def process_cluster(config: RunConfig, incarnation: int) -> Cluster:
     def place_worker(worker_id: int, incarnation: int) -> Node:
         return RolloutNode(rollout_settings(config), worker_id, incarnation, calls, targets, 0)
 
+    workers = [place_worker(worker_id, incarnation) for worker_id in range(config.workers)]
+
+    def abandon() -> None:
+        for node in (learner, *workers):
+            node.saved(LAST_WRITE_S)
+
     return Cluster(
         calls=calls,
         incarnation=incarnation,
         learner=learner,
-        workers=[place_worker(worker_id, incarnation) for worker_id in range(config.workers)],
+        workers=workers,
         targets=targets,
         shards_are_parts=config.replay_placement == "actors",
         place_worker=place_worker,
@@ -130,6 +139,6 @@ def process_cluster(config: RunConfig, incarnation: int) -> Cluster:
         blocks_in_flight=config.workers,
         updates_in_flight=1,
         eval_tasks=1,
-        abandon=lambda: None,
+        abandon=abandon,
         close=lambda: None,
     )

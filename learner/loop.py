@@ -111,8 +111,13 @@ class TrainingLoop:
         try:
             return self._run()
         except Exception:
-            self._saver.give_up()  # what writes must not outlive its run: another attempt may begin at once
+            self._give_up()
             raise
+
+    def _give_up(self) -> None:
+        """Ends all parts, and what writes: neither must outlive its attempt, since another may begin at once."""
+        self._cluster.abandon()
+        self._saver.give_up()
 
     def _run(self) -> bool:
         if not self._restored:
@@ -284,6 +289,7 @@ class TrainingLoop:
 
     def lost(self, failure: PartFailed) -> RunLost:
         """Ends this attempt because of a failure outside of the rounds of training (see `run` for other errors)."""
+        self._give_up()
         try:
             self._mender.decide(failure)
         except RunLost as lost:

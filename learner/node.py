@@ -199,14 +199,17 @@ class LearnerNode:
         shards = [self._result(i, ref) for i, ref in enumerate(refs)]
         return {"shards": shards, "rng": self._rng.bit_generator.state, "sizes": self._masses.tolist()}
 
-    def saved(self) -> Written | None:
+    def saved(self, timeout_s: float = 0.0) -> Written | None:
         """How the last `save` ended, all shards included; None while something of it is being written.
+
+        Args:
+          timeout_s: how long to wait for each.
 
         Raises:
           PartFailed: a shard failed, and the others have written.
         """
-        parts, failures = [self._writer.result()], []
-        refs = [self._shard_calls.start(shard, "saved") for shard in self._shards]
+        parts, failures = [self._writer.result(timeout_s)], []
+        refs = [self._shard_calls.start(shard, "saved", timeout_s) for shard in self._shards]
         for i, ref in enumerate(refs):
             try:
                 parts.append(self._result(i, ref))

@@ -182,7 +182,6 @@ def _train(
                         delivery.up_to(journal.length)  # even if the end has no checkpoint
                     _deliver_rest(delivery, tracker, result, say)
                     return result, rows
-        cluster.abandon()
         resumed = False
         checkpoint = last_checkpoint(folder, config)
         display.message(f"going on from {checkpoint.folder if checkpoint else 'the start'}")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import threading
 import time
 
 import mlflow
@@ -11,6 +12,7 @@ import pytest
 from actors.baselines import Baseline
 from actors.evaluation_store import load_evaluation
 from actors.evaluator import evaluate
+from actors.parts import sync_all
 from actors.result_table import read_table
 from actors.vector_env import env_shape
 from learner.checkpoint import finished_names
@@ -227,6 +229,21 @@ def test_a_checkpoint_of_another_config_is_no_reason_to_begin_anew(store, cell, 
     with pytest.raises(CheckpointError, match="learning_rate is 0.5 instead of 0.001"):
         run_cell(SWEEP, other._replace(key=cell.key), place, id)
     assert sorted(checkpoints.iterdir()) == kept
+
+
+def test_nothing_writes_on_after_a_crash(store, cell, tmp_path, monkeypatch):
+    cell = cell._replace(key=f"{cell.key}-writes")
+
+    def slow_sync(path):
+        time.sleep(0.5)
+        sync_all(path)
+
+    monkeypatch.setattr("actors.parts.sync_all", slow_sync)
+    with pytest.raises(Crash):
+        run_cell(SWEEP, cell, SweepPlace(tmp_path, store, "cells"), crashing_at(1_500))  # one begins at 1,000
+    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith(("shoal-part", "shoal-ch"))]
+    checkpoints = tmp_path / cell.key / "checkpoints"
+    assert [path.name for path in checkpoints.iterdir()] == finished_names(checkpoints)
 
 
 def test_a_cell_whose_folder_is_gone_keeps_its_mlflow_run(store, cell, tmp_path):
