@@ -145,12 +145,13 @@ class TrainingLoop:
 
     def _start_collects(self) -> None:
         config = self._config
-        for _ in range(self._cluster.collects_in_flight):
+        at_once = self._at_once(self._cluster.collects_in_flight)
+        for _ in range(at_once):
             if self._all_is_ordered():
                 return  # between rounds, so that a resumed run has every worker's turn where it would have been
             for part in self._mender.workers:
                 worker_id = part.number
-                if self._under_way.collects[worker_id] >= self._cluster.collects_in_flight:
+                if self._under_way.collects[worker_id] >= at_once:
                     continue
                 if not self._pacer.may_collect(self._under_way.blocks_in_flight):
                     self._pacer.waited(to_insert=True)
@@ -164,7 +165,7 @@ class TrainingLoop:
         return self.env_steps + expected >= self._config.total_env_steps
 
     def _start_updates(self) -> None:
-        while self._under_way.count("update") < self._cluster.updates_in_flight:
+        while self._under_way.count("update") < self._at_once(self._cluster.updates_in_flight):
             updates = self._pacer.updates_due()
             if not updates:
                 self._pacer.waited(to_insert=False)
@@ -259,8 +260,16 @@ class TrainingLoop:
         """Tells of a checkpoint that has ended; begins one that is due, once none and no evaluation is under way."""
         self._mend_if(self._saver.poll())
         self._saver.is_wanted |= self._progress.is_due("checkpoint")
-        if self._saver.may_begin and not self._evaluates():
+        if self._saves_soon() and max(self._under_way.count("update"), *self._under_way.collects) <= 1:
             self.checkpoint()
+
+    def _saves_soon(self) -> bool:
+        """Whether a checkpoint begins once no part has more than one call under way, which it waits for."""
+        return self._saver.may_begin and not self._evaluates()
+
+    def _at_once(self, in_flight: int) -> int:
+        """Calls that one part may have under way, of which there are `in_flight` unless a checkpoint is to begin."""
+        return 1 if self._saves_soon() else in_flight
 
     def _save_the_end(self) -> None:
         """Writes a checkpoint of this moment, again where a part fails meanwhile."""

@@ -1,6 +1,7 @@
 """The training loop ends where it was told to, however far ahead its rollout workers go."""
 
 import dataclasses
+from collections import Counter
 from contextlib import closing
 
 import pytest
@@ -10,8 +11,20 @@ from learner.cluster import process_cluster, rollout_settings
 from learner.journal import Journal
 from learner.loop import TrainingLoop
 from tests.checkpointing import Silent
+from tests.learner.failing_calls import FailingCalls
 
 PUSHES = 2
+
+
+def run_ahead(config, calls=None):
+    """A cluster in this process whose parts may have two calls under way, as over Ray."""
+    cluster = process_cluster(config, 0)
+    calls = calls or cluster.calls
+    nodes = [RolloutNode(rollout_settings(config), i, 0, calls, cluster.targets, PUSHES) for i in range(config.workers)]
+    blocks = config.workers * (2 + PUSHES)
+    return cluster._replace(
+        calls=calls, workers=nodes, collects_in_flight=2, updates_in_flight=2, blocks_in_flight=blocks
+    )
 
 
 @pytest.mark.parametrize("workers", [1, 3])
@@ -19,13 +32,35 @@ PUSHES = 2
 def test_no_round_of_blocks_is_ordered_past_the_end(small_run, tmp_path, workers, blocks):
     block = small_run.block_env_steps
     config = dataclasses.replace(small_run, workers=workers, total_env_steps=int(blocks * block), min_replay=block)
-    cluster = process_cluster(config, 0)
-    nodes = [
-        RolloutNode(rollout_settings(config), i, 0, cluster.calls, cluster.targets, PUSHES) for i in range(workers)
-    ]
-    cluster = cluster._replace(workers=nodes, collects_in_flight=2, blocks_in_flight=workers * (2 + PUSHES))
     with closing(Journal(tmp_path / "m.jsonl", 0)) as journal:
-        loop = TrainingLoop(config, cluster, journal, tmp_path / "checkpoints", Silent(), bool)
+        loop = TrainingLoop(config, run_ahead(config), journal, tmp_path / "checkpoints", Silent(), bool)
         assert loop.run()
     assert config.total_env_steps <= loop.env_steps < config.total_env_steps + workers * block
     assert loop.saved is not None
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_a_checkpoint_waits_for_one_call_of_each_part(small_run, tmp_path, monkeypatch, workers):
+    block = small_run.block_env_steps
+    config = dataclasses.replace(
+        small_run, workers=workers, total_env_steps=60 * block, checkpoint_every_env_steps=10 * block, min_replay=block
+    )
+    begun, rounds = [], []
+
+    def note():
+        rounds.append(most())
+        if loop._saver._checkpointer._thread is not None:
+            loop._saver._checkpointer._thread.join()  # so that every checkpoint that is due is begun
+
+    def most():
+        calls = Counter(pending.part for pending in loop._under_way._calls.values())
+        return max(calls.values(), default=0)
+
+    with closing(Journal(tmp_path / "m.jsonl", 0)) as journal:
+        cluster = run_ahead(config, FailingCalls(lambda node, method: None))
+        loop = TrainingLoop(config, cluster, journal, tmp_path / "checkpoints", Silent(), note)
+        begin = loop.checkpoint
+        monkeypatch.setattr(loop, "checkpoint", lambda: (begun.append(most()), begin()))
+        assert loop.run()
+    assert max(rounds) == 2  # else there is nothing to hold back
+    assert len(begun) >= 5 and max(begun) == 1
