@@ -4,160 +4,27 @@ Each contest sets the environment, the network, the batch and the samples per in
 process of its own, one at a time, in turn; first each tries several numbers of environments and threads and keeps the
 fastest. Then come rates (env steps and updates a second once training has begun) and the time to a threshold: from the
 start of the training, environments and Ray being up, to the first evaluation that reaches it. The watch stands still
-while the judge plays, and so does the training.
+while the judge plays, and so does the training. "The limit" is no contender: what bare simulation and bare updates
+would leave time for on this machine. The last table has all of it as ratios.
 """
 
 import argparse
 import dataclasses
-import importlib.util
-import json
-import os
-import subprocess
 import sys
-import time
-import tomllib
 from pathlib import Path
-from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table
 
-from actors.vector_env import env_shape
-from learner.config import RunConfig, from_dict
+from learner.config import RunConfig
 from learner.ray_auth import guard_ray
-from sim_core.config import WorldConfig
-from tests.benchmarks.contest import Finding, Heat
+from tests.benchmarks.contest import Finding
+from tests.benchmarks.entrants import LIMIT, OURS, Contender, Contest, Entry, contenders, contests
 from tests.benchmarks.timing import ratio, spread
 
-ROOT = Path(__file__).parents[2]
-OURS = "shoal"
+AT_LEAST = "≥ "
 PEERS = ("Stable-Baselines3", "TorchRL", "RLlib")
 SWEEP_S = 6.0
-
-
-class Contest(NamedTuple):
-    """A training that is set; `threshold` of the success rate or mean return, None to measure rates alone."""
-
-    config: RunConfig
-    threshold: float | None
-
-    @property
-    def title(self) -> str:
-        config = self.config
-        shape = env_shape(config.env)
-        what = f"{config.world.method} {config.world.setup}" if config.env.is_swarm else config.env_id
-        sizes = "-".join(map(str, (shape.observation_size, *config.hidden_sizes, shape.num_actions)))
-        return f"{what}, {sizes}, batch {config.batch_size}, {config.samples_per_insert:g} samples per insert"
-
-
-class Style(NamedTuple):
-    """How a contender may go about a training."""
-
-    envs: int
-    threads: int
-    variant: str = ""
-
-    def text(self) -> str:
-        return " ".join(filter(None, (f"{self.envs} envs, {self.threads} threads", self.variant)))
-
-
-class Contender(NamedTuple):
-    """Who trains: a module of `contenders`, and the interpreter that has what it needs."""
-
-    module: str
-    python: str = sys.executable
-
-    def styles(self, contest: Contest) -> list[Style]:
-        if self.module == "shoal":
-            return [Style(envs, 1) for envs in (16, 64, 128)]
-        if self.module == "sb3":
-            kinds = ("", "vectorised") if contest.config.env.is_swarm else ("",)
-            return [Style(envs, threads, kind) for kind in kinds for envs in (8, 64, 256) for threads in (1, 2)]
-        return [Style(envs, 1) for envs in (16, 64)]
-
-
-def contests() -> dict[str, Contest]:
-    cartpole = from_dict(tomllib.loads((ROOT / "deploy/configs/cartpole.toml").read_text("utf-8")))
-    often = {"eval_every_env_steps": 50_000, "eval_episodes": 200, "checkpoint_every_env_steps": 10**9}
-    seldom = {"total_env_steps": 10**8, "eval_every_env_steps": 10**9, "checkpoint_every_env_steps": 10**9}
-    swarm, wide = RunConfig(), RunConfig(world=WorldConfig(method="in", robots=5, groups=8))
-    return {
-        "cartpole": Contest(
-            dataclasses.replace(cartpole, batch_size=512, n_step=1, **seldom),
-            None,
-        ),
-        "cartpole475": Contest(
-            dataclasses.replace(
-                cartpole, eval_every_env_steps=5_000, eval_episodes=20, checkpoint_every_env_steps=10**9
-            ),
-            475.0,
-        ),
-        "swarm": Contest(
-            dataclasses.replace(swarm, **often),
-            0.85,
-        ),
-        "wide": Contest(
-            dataclasses.replace(
-                wide, hidden_sizes=(256, 256), batch_size=512, samples_per_insert=8.0, n_step=1, **seldom
-            ),
-            None,
-        ),
-    }
-
-
-def contenders(rllib: Path | None, console: Console) -> dict[str, Contender]:
-    """Those that can take part; the others are named."""
-    found = {OURS: Contender("shoal")}
-    for name, module, library in (
-        ("Stable-Baselines3", "sb3", "stable_baselines3"),
-        ("TorchRL", "torchrl", "torchrl"),
-    ):
-        if importlib.util.find_spec(library) is None:
-            console.print(f"{name}: not installed (the extra `peers`), left out")
-        else:
-            found[name] = Contender(module)
-    if rllib is None:
-        console.print("RLlib: no --rllib PYTHON with it, left out")
-    else:
-        found["RLlib"] = Contender("rllib", str(rllib))
-    return found
-
-
-def run_heat(contender: Contender, heat: Heat) -> Finding:
-    """One turn in a process of its own.
-
-    Raises:
-      RuntimeError: it fails.
-    """
-    command = [contender.python, "-m", f"tests.benchmarks.contenders.{contender.module}"]
-    threads = {name: str(heat.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
-    quiet = {"PYTHONWARNINGS": "ignore", "RL_LOGGING_LEVEL": "ERROR", "RAY_TRAIN_V2_ENABLED": "0"}
-    began = dataclasses.replace(heat, began_s=time.time())
-    done = subprocess.run(
-        [*command, began.to_json()],
-        cwd=ROOT,
-        env={**os.environ, **threads, **quiet},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=heat.seconds * 3 + 600,
-    )
-    if done.returncode:
-        raise RuntimeError(f"{contender.module} failed: {done.stderr[-2000:]}")
-    return Finding(**json.loads(done.stdout.splitlines()[-1]))
-
-
-class Entry(NamedTuple):
-    """A contender in the style that suits it best."""
-
-    name: str
-    contender: Contender
-    style: Style
-
-    def run(self, config: RunConfig, seconds: float, threshold: float | None) -> Finding:
-        style = self.style
-        heat = Heat(config, style.envs, style.threads, seconds, threshold, style.variant)
-        return run_heat(self.contender, heat)
 
 
 def fastest(name: str, contender: Contender, contest: Contest, console: Console) -> Entry:
@@ -191,11 +58,11 @@ def threshold_table(contest: Contest, found: dict[Entry, list[Finding]], limit_s
     table = Table(title=f"{contest.title}: seconds to {contest.threshold:g}, median (lowest … highest)")
     for column in ("contender", "its best", "reached", "seconds", "with start-up", "env steps", "it / shoal"):
         table.add_column(column, justify="left" if column in ("contender", "its best") else "right")
-    waits = {entry.name: [seconds_of(finding, limit_s) for finding in findings] for entry, findings in found.items()}
+    waits = seconds_of(found, limit_s)
     for entry, findings in found.items():
         seconds = waits[entry.name]
         reached = sum(finding.to_threshold_s is not None for finding in findings)
-        least = "" if reached == len(findings) else "≥ "
+        least = "" if reached == len(findings) else AT_LEAST
         whole = spread([one + finding.start_up_s for one, finding in zip(seconds, findings, strict=True)])
         env_steps = spread([finding.env_steps for finding in findings])
         against = "" if entry.name == OURS else least + ratio(seconds, waits[OURS]).text(1)
@@ -211,20 +78,60 @@ def threshold_table(contest: Contest, found: dict[Entry, list[Finding]], limit_s
     return table
 
 
-def seconds_of(finding: Finding, limit_s: float) -> float:
-    """Time to the threshold, or the limit where it was not reached."""
-    return limit_s if finding.to_threshold_s is None else finding.to_threshold_s
+def seconds_of(found: dict[Entry, list[Finding]], limit_s: float) -> dict[str, list[float]]:
+    """Times to the threshold by contender, the limit where it was not reached."""
+    return {
+        entry.name: [limit_s if one.to_threshold_s is None else one.to_threshold_s for one in findings]
+        for entry, findings in found.items()
+    }
 
 
-def hold(contest: Contest, field: dict[str, Contender], options: argparse.Namespace, console: Console) -> None:
-    """Runs one contest and prints its tables."""
+def rate_ratios(contest: Contest, found: dict[Entry, list[Finding]]) -> dict[str, str]:
+    """A line of the last table: our env steps/s over those of each other."""
+    steps = {entry.name: [finding.env_steps_per_s for finding in findings] for entry, findings in found.items()}
+    others = {name: ratio(steps[OURS], theirs).text(2) for name, theirs in steps.items() if name != OURS}
+    return {"": f"{contest.title}: env steps/s", **others}
+
+
+def time_ratios(contest: Contest, found: dict[Entry, list[Finding]], limit_s: float) -> dict[str, str]:
+    """A line of the last table: each other's time to the threshold over ours."""
+    waits = seconds_of(found, limit_s)
+    late = {entry.name for entry, findings in found.items() if any(one.to_threshold_s is None for one in findings)}
+    others = {
+        name: (AT_LEAST if name in late else "") + ratio(theirs, waits[OURS]).text(2)
+        for name, theirs in waits.items()
+        if name != OURS
+    }
+    return {"": f"the same: time to {contest.threshold:g}", **others}
+
+
+def last_table(lines: list[dict[str, str]]) -> Table:
+    """All ratios that were found."""
+    names = list(dict.fromkeys(name for line in lines for name in line))
+    table = Table(title="shoal's rate, or the inverse of its time, over that of each: median (lowest … highest)")
+    for name in names:
+        table.add_column(name, justify="right" if name else "left")
+    for line in lines:
+        table.add_row(*(line.get(name, "") for name in names))
+    return table
+
+
+def hold(
+    contest: Contest, field: dict[str, Contender], options: argparse.Namespace, console: Console
+) -> list[dict[str, str]]:
+    """Runs one contest and prints its tables; returns the lines of the last one."""
     console.print(contest.title)
     entries = [fastest(name, contender, contest, console) for name, contender in field.items()]
-    seeds = [dataclasses.replace(contest.config, seed=seed) for seed in range(options.rounds)]
-    console.print(rate_table(contest, in_turn(entries, [contest.config] * options.rounds, options.seconds, None)))
+    found = in_turn(entries, [contest.config] * options.rounds, options.seconds, None)
+    console.print(rate_table(contest, found))
+    lines = [rate_ratios(contest, found)]
     if contest.threshold is not None:
-        found = in_turn(entries, seeds, options.limit_s, contest.threshold)
+        seeds = [dataclasses.replace(contest.config, seed=seed) for seed in range(options.rounds)]
+        players = [entry for entry in entries if entry.name != LIMIT]
+        found = in_turn(players, seeds, options.limit_s, contest.threshold)
         console.print(threshold_table(contest, found, options.limit_s))
+        lines.append(time_ratios(contest, found, options.limit_s))
+    return lines
 
 
 def in_turn(
@@ -262,10 +169,9 @@ def main() -> int:
     console = Console(width=160)
     field = contenders(options.rllib, console)
     if options.only:
-        field = {name: contender for name, contender in field.items() if name in (OURS, *options.only)}
-    for name, contest in contests().items():
-        if not options.contests or name in options.contests:
-            hold(contest, field, options, console)
+        field = {name: contender for name, contender in field.items() if name in (OURS, LIMIT, *options.only)}
+    held = [contest for name, contest in contests().items() if not options.contests or name in options.contests]
+    console.print(last_table([line for contest in held for line in hold(contest, field, options, console)]))
     return 0
 
 

@@ -10,11 +10,12 @@ from stable_baselines3.common.env_util import make_vec_env
 from actors.network import Policy, QNetwork
 from actors.vector_env import env_shape, make_vector_env
 from learner.config import RunConfig
-from tests.benchmarks import contest, peers
+from tests.benchmarks import contest, entrants, peers
+from tests.benchmarks.contenders.limit import most_updates
 from tests.benchmarks.contenders.sb3 import Vectorised
-from tests.benchmarks.contest import Heat, Lap, float_env, heat_of, policy_of, rhythm, target_every_env_steps
+from tests.benchmarks.contest import Finding, Heat, Lap, float_env, heat_of, policy_of, rhythm, target_every_env_steps
 
-CARTPOLE = peers.contests()["cartpole"].config
+CARTPOLE = entrants.contests()["cartpole"].config
 
 
 class Clock:
@@ -119,24 +120,40 @@ def test_the_vectorised_environment_does_as_stable_baselines3s_own():
 
 
 def test_peers_get_the_world_that_is_set():
-    spec = peers.contests()["wide"].config.env
+    spec = entrants.contests()["wide"].config.env
     shape = env_shape(spec).observation_space.shape
     assert float_env(spec).observation_space.shape == shape == (72,)
 
 
+def test_the_limit_is_one_core_for_the_learner_and_all_cores_for_everything():
+    config = dataclasses.replace(CARTPOLE, batch_size=100, samples_per_insert=10.0)  # ten env steps an update
+    assert most_updates(config, env_steps_per_s=1e12, updates_per_s=50.0, cores=2) == 50.0
+    assert most_updates(config, env_steps_per_s=100.0, updates_per_s=20.0, cores=2) == pytest.approx(2 / (0.1 + 0.05))
+
+
+def test_the_last_table_has_what_ours_is_to_each():
+    ours, other = (entrants.Entry(name, entrants.Contender("x"), entrants.Style(1, 1)) for name in ("shoal", "other"))
+    made = Finding(600.0, 1.0, 0.0, 2.0, 10, 0.9)
+    slower = [made._replace(env_steps_per_s=rate, to_threshold_s=time_s) for rate, time_s in ((300, 4.0), (100, None))]
+    found = {ours: [made, made], other: slower}
+    contest = entrants.contests()["swarm"]
+    assert peers.rate_ratios(contest, found)["other"] == "4.00 (2.00 … 6.00)"
+    assert peers.time_ratios(contest, found, 20.0)["other"] == "≥ 6.00 (2.00 … 10.00)"
+
+
 @pytest.mark.ray
 @pytest.mark.slow
-@pytest.mark.parametrize("module", ["shoal", "sb3"])
+@pytest.mark.parametrize("module", ["shoal", "sb3", "limit"])
 def test_contenders_draw_as_many_samples_per_insert_as_they_are_told(module):
-    contender = peers.Contender(module)
-    found = peers.run_heat(contender, Heat(CARTPOLE, 16, 1, 2.0, None))
+    contender = entrants.Contender(module)
+    found = entrants.run_heat(contender, Heat(CARTPOLE, 16, 1, 2.0, None))
     drawn = found.updates_per_s * CARTPOLE.batch_size / found.env_steps_per_s
     assert drawn == pytest.approx(CARTPOLE.samples_per_insert, rel=0.25)
-    assert found.start_up_s > 0
+    assert found.start_up_s > 0 or module == "limit"
 
 
 def test_a_contender_that_fails_says_why():
     with pytest.raises(RuntimeError, match=r"(?s)sb3 failed: .*Environment `nothing` doesn't exist"):
-        peers.run_heat(
-            peers.Contender("sb3"), Heat(dataclasses.replace(CARTPOLE, env_id="nothing-v0"), 1, 1, 1.0, None)
+        entrants.run_heat(
+            entrants.Contender("sb3"), Heat(dataclasses.replace(CARTPOLE, env_id="nothing-v0"), 1, 1, 1.0, None)
         )
