@@ -233,6 +233,11 @@ def test_live_waits_for_the_first_checkpoint(browser, trained, tmp_path):
         assert read(f"{url}episode.json?number=2")["setup"].endswith("seed 9")
 
 
+def listen_to_ctrl_c():
+    """As in a terminal: what a script starts in the background, as it may these tests, ignores it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.mark.parametrize("command", [["dashboard", "--serve"], ["watch", "--live"]])
 def test_ctrl_c_ends_a_server(trained, tmp_path, command):
     arguments = [command[0], str(trained.path), command[1], "--port", "0"]
@@ -243,6 +248,7 @@ def test_ctrl_c_ends_a_server(trained, tmp_path, command):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=listen_to_ctrl_c,
     ) as process:
         try:
             url = re.match(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
