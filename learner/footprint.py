@@ -45,7 +45,7 @@ def parts_bytes(config: RunConfig, shape: EnvShape) -> dict[str, int]:
         * row,
         "replay_capacity": config.replay_capacity * (packed + priority)
         + FRAME_PLACES * frames * transition["observation"].itemsize,
-        "batch_size and updates_per_call": 3 * config.batch_size * config.updates_per_call * row,
+        "batch_size and updates_per_call": 4 * config.batch_size * config.updates_per_call * row,
         "hidden_sizes": 4 * NETWORK_COPIES * weights,
         "eval_episodes and final_eval_episodes": EPISODE_BYTES * max(config.eval_episodes, config.final_eval_episodes),
     }

@@ -20,6 +20,7 @@ from actors.shard_node import ShardNode
 from actors.stopwatch import Stopwatch
 from actors.transitions import STORES, WAITS, AddReply, Delivered, Draws, SampleReply, TransitionBlock
 from learner.double_dqn import importance_weights
+from learner.draw_ahead import DrawAhead, DrawWhenAsked
 from learner.learner import Learner
 from learner.updates import LearnerSettings, UpdateStats
 
@@ -60,9 +61,12 @@ class LearnerNode:
       settings: see LearnerSettings.
       shards: nodes with `sample`, `set_priorities`, `publish`, `mass`, `save`, `saved`, `load`.
       shard_calls: how to call the shards.
+      draws_ahead: whether the rows of the next call of updates are drawn during this one, in another thread.
     """
 
-    def __init__(self, settings: LearnerSettings, shards: list[Node], shard_calls: Calls) -> None:
+    def __init__(
+        self, settings: LearnerSettings, shards: list[Node], shard_calls: Calls, draws_ahead: bool = False
+    ) -> None:
         torch.set_num_threads(1)
         self._settings = settings
         self._learner = Learner(settings)
@@ -72,6 +76,7 @@ class LearnerNode:
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence((settings.seed, 1))))
         self._masses = np.zeros(len(shards), np.float64)
         self._answers: dict[int, Ref] = {}
+        self._samples = DrawAhead(self._sample) if draws_ahead else DrawWhenAsked(self._sample)
         self._writer = PartWriter()
         self._watch = Stopwatch()
         self.publish()
@@ -95,6 +100,7 @@ class LearnerNode:
         self._shards[index], self._shard_incarnations[index] = shard, incarnation
         self._masses[index] = 0.0
         self._answers.pop(index, None)
+        self._samples.drop()
         self._shard_calls.start(shard, "publish", self._weights)
 
     def _result(self, index: int, ref: Ref) -> Any:
@@ -120,16 +126,20 @@ class LearnerNode:
         Of prioritised shards the sample is weighted, and the TD errors go back to the shards that it came from.
         """
         self._watch.lap(WAITS)
-        sample, weights = self._sample(updates * self._settings.batch_size), None
+        count = updates * self._settings.batch_size
+        sample, weights = self._samples.take(count), None
         self._watch.lap(SAMPLES)
         if sample.draws is not None:
             weights = importance_weights(sample.draws.probability, self._settings.batch_size, importance_exponent)
+        self._samples.begin(count)
         stats = self._learner.update(sample.columns, learning_rate, weights)
         self._watch.lap(UPDATES)
         if sample.draws is not None:
             self._answer(sample)
         self.publish()
         self._watch.lap(PUBLISHES)
+        self._samples.settle()
+        self._watch.lap(SAMPLES)
         return UpdateReport(stats, self._learner.updates, self._watch.take())
 
     def publish(self) -> None:
@@ -242,6 +252,7 @@ class LearnerNode:
             self._slow_result(i, ref)
         self._rng.bit_generator.state = state["rng"]
         self._answers.clear()
+        self._samples.drop()
         self._masses[:] = state["sizes"]
         self.publish()
 

@@ -138,10 +138,11 @@ class RayCalls:
 def _make_learner(config: RunConfig, shards: list[Node], calls: RayCalls) -> LearnerNode:
     """Builds the learner in its actor; without shard actors, its shards too."""
     shape = env_shape(config.env)
+    settings = learner_settings(config, shape)
     if shards:
-        return LearnerNode(learner_settings(config, shape), shards, calls)
+        return LearnerNode(settings, shards, calls, draws_ahead=config.replay == "uniform")
     embedded: list[Node] = [ShardNode(settings) for settings in shard_settings(config, shape)]
-    return LearnerNode(learner_settings(config, shape), embedded, LocalCalls())
+    return LearnerNode(settings, embedded, LocalCalls())
 
 
 class LearnerActor(LearnerNode):

@@ -1,6 +1,7 @@
 """Where the time goes: the bare simulator, the rollout worker, the learner, and the whole service over Ray."""
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -14,12 +15,26 @@ from learner.cluster import learner_settings, rollout_settings
 from learner.config import RunConfig
 from learner.learner import Learner
 from sim_core.config import WorldConfig
-from tests.benchmarks.ray_service import ENDLESS, measured_point
+from tests.benchmarks.ray_service import ENDLESS, Point, measured_point
 from tests.benchmarks.timing import rates, ratio, spread
 
 ROUNDS = 5
-SERVICE_S = 30.0
-SAMPLES_PER_INSERT = (2.0, 8.0)
+SERVICE_S = 20.0
+SERVICE_ROUNDS = 3
+
+
+class Kind(NamedTuple):
+    """A way to run the service over Ray; the shard of "actors" is a process of its own."""
+
+    samples_per_insert: float
+    replay_placement: str
+
+    def text(self) -> str:
+        where = "" if self.replay_placement == "learner" else ", shard of its own"
+        return f"service over Ray, {self.samples_per_insert:g} samples per insert{where}"
+
+
+KINDS = (Kind(2.0, "learner"), Kind(8.0, "learner"), Kind(8.0, "actors"))
 """With 2 the rollout worker and the learner fill a core each, with 8 the learner alone decides."""
 
 SETUPS = (((10, 2), 6), ((10, 8), 2), ((25, 8), 1))
@@ -82,28 +97,30 @@ def rollout_table() -> Table:
 
 
 def service_table(config: RunConfig) -> Table:
-    """The service over Ray, of its bare parts."""
+    """The service over Ray, of its bare parts, which are measured anew in every round."""
     bare = {"simulator": simulator_work(config, 6), "learner": learner_work(config)}
-    found = {name: rates({name: work}, ROUNDS)[name] for name, work in bare.items()}
-    table = Table(title=f"{config.world.setup} M_sensor")
-    for column in ("part", "env steps/s", "updates/s", "of the bare part"):
+    alone: dict[str, list[float]] = {name: [] for name in bare}
+    points: dict[Kind, list[Point]] = {kind: [] for kind in KINDS}
+    for _ in range(SERVICE_ROUNDS):
+        for kind in KINDS:
+            for name, work in bare.items():
+                alone[name] += rates({name: work}, 1)[name]
+            points[kind].append(measured_point(dataclasses.replace(config, **kind._asdict()), SERVICE_S))
+    table = Table(title=f"{config.world.setup} M_sensor, median (lowest … highest)")
+    for column in ("part", "env steps/s", "updates/s", "of the bare simulator", "of the bare learner"):
         table.add_column(column, justify="right")
-    simulator, learner = spread(found["simulator"]), spread(found["learner"])
-    table.add_row("bare simulator, one core", simulator.text(), "", "")
-    table.add_row(f"bare learner, batch {config.batch_size}, one core", "", learner.text(), "")
-    for samples in SAMPLES_PER_INSERT:
-        service = measured_point(dataclasses.replace(config, samples_per_insert=samples), SERVICE_S)
-        shares = service.env_steps_per_s / simulator.median, service.updates_per_s / learner.median
-        table.add_row(
-            f"service over Ray, 1 worker + learner, {samples:g} samples per insert",
-            f"{service.env_steps_per_s:,.0f}",
-            f"{service.updates_per_s:,.0f}",
-            " · ".join(f"{share:.2f}" for share in shares),
-        )
+    table.add_row("bare simulator, one core", spread(alone["simulator"]).text(), "", "", "")
+    table.add_row(f"bare learner, batch {config.batch_size}, one core", "", spread(alone["learner"]).text(), "", "")
+    for i, kind in enumerate(KINDS):
+        env_steps = [point.env_steps_per_s for point in points[kind]]
+        updates = [point.updates_per_s for point in points[kind]]
+        mine = {name: found[i :: len(KINDS)] for name, found in alone.items()}
+        shares = (ratio(env_steps, mine["simulator"]).text(2), ratio(updates, mine["learner"]).text(2))
+        table.add_row(kind.text(), spread(env_steps).text(), spread(updates).text(), *shares)
     return table
 
 
 def main() -> None:
-    console = Console(width=140)
+    console = Console(width=160)
     for table in (rollout_table(), service_table(RunConfig(**ENDLESS))):
         console.print(table)

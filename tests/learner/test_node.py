@@ -285,8 +285,8 @@ def td_errors_by_hand(weights, rows):
 def test_td_errors_go_back_to_the_rows_that_they_are_of(make_learner, make_rows, sizes):
     learner, shards = make_learner(len(sizes), priorities=HALF)
     fill(learner, shards, make_rows, sizes)
-    weights, sampled, real = learner.weights(), [], learner._sample
-    learner._sample = lambda count: sampled.append(real(count)) or sampled[0]
+    weights, sampled, real = learner.weights(), [], learner._samples.take
+    learner._samples.take = lambda count: sampled.append(real(count)) or sampled[0]
     learner.update(1, RATE, 1.0)
     drawn = {round(reward) for reward in sampled[0].columns["reward"].tolist()}
     assert 1 < len(drawn) <= 16
