@@ -94,9 +94,11 @@ def rate_ratios(contest: Contest, found: dict[Entry, list[Finding]]) -> dict[str
 
 
 def time_ratios(contest: Contest, found: dict[Entry, list[Finding]], limit_s: float) -> dict[str, str]:
-    """A line of the last table: each other's time to the threshold over ours."""
+    """A line of the last table: each other's time to the threshold over ours, where ours reached it in all rounds."""
     waits = seconds_of(found, limit_s)
     late = {entry.name for entry, findings in found.items() if any(one.to_threshold_s is None for one in findings)}
+    if OURS in late:
+        return {"": f"the same: time to {contest.threshold:g}, which shoal did not always reach"}
     others = {
         name: (AT_LEAST if name in late else "") + ratio(theirs, waits[OURS]).text(2)
         for name, theirs in waits.items()

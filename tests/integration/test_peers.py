@@ -139,6 +139,8 @@ def test_the_last_table_has_what_ours_is_to_each():
     contest = entrants.contests()["swarm"]
     assert peers.rate_ratios(contest, found)["other"] == "4.00 (2.00 … 6.00)"
     assert peers.time_ratios(contest, found, 20.0)["other"] == "≥ 6.00 (2.00 … 10.00)"
+    found[ours][0] = made._replace(to_threshold_s=None)
+    assert "other" not in peers.time_ratios(contest, found, 20.0)
 
 
 @pytest.mark.ray
