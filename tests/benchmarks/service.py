@@ -34,8 +34,10 @@ class Kind(NamedTuple):
         return f"service over Ray, {self.samples_per_insert:g} samples per insert{where}"
 
 
-KINDS = (Kind(2.0, "learner"), Kind(8.0, "learner"), Kind(8.0, "actors"))
+SAMPLES_PER_INSERT = (2.0, 8.0)
 """With 2 the rollout worker and the learner fill a core each, with 8 the learner alone decides."""
+
+KINDS = (*(Kind(samples, "learner") for samples in SAMPLES_PER_INSERT), Kind(8.0, "actors"))
 
 SETUPS = (((10, 2), 6), ((10, 8), 2), ((25, 8), 1))
 """Setups whose rollout worker is set beside its bare simulator, and blocks of one measurement."""
