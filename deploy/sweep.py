@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from actors.result_table import ResultRow, read_table, write_table
+from actors.result_table import LEARNED, ResultRow, read_table, write_table
 from deploy.folders import check_lasting, check_plain_name, make_folder
 from deploy.options import Sweep
 from deploy.sweep_board import SweepBoard, make_board
@@ -78,7 +78,8 @@ class SweepResults:
         """
         rows = self._rows()
         write_table(self.table, rows)
-        examples = {cell.config.world.method: to_dict(cell.config) for cell in reversed(self.cells)}
+        trained_last = sorted(reversed(self.cells), key=lambda cell: cell.policy == LEARNED)
+        examples = {cell.config.world.method: to_dict(cell.config) for cell in trained_last}
         settings = {"sweep": dataclasses.asdict(self._grid), "commit": self._commit, "a_cell_of_each_method": examples}
         write_json(self.folder / "settings.json", settings)
         return done_cells(self._grid, self.cells, rows)
