@@ -78,8 +78,8 @@ class SweepResults:
         """
         rows = self._rows()
         write_table(self.table, rows)
-        trained_last = sorted(reversed(self.cells), key=lambda cell: cell.policy == LEARNED)
-        examples = {cell.config.world.method: to_dict(cell.config) for cell in trained_last}
+        trained = [cell.config for cell in self.cells if cell.policy == LEARNED]
+        examples = {config.world.method: to_dict(config) for config in reversed(trained)}
         settings = {"sweep": dataclasses.asdict(self._grid), "commit": self._commit, "a_cell_of_each_method": examples}
         write_json(self.folder / "settings.json", settings)
         return done_cells(self._grid, self.cells, rows)
