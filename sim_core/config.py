@@ -35,6 +35,8 @@ class WorldConfig:
     """Whether the swarm avoids the learning robot and counts it in its flock (the method's: M_sensor only)."""
     horizon_is: Literal["method", "cut", "failure"] = "method"
     """A timeout cuts and keeps the state's value, or fails with -tau (M_sensor: cuts; M_IN, M_OUT: Alg. 4.1, 4.2)."""
+    captured_is: Literal["among", "surrounded"] = "among"
+    """Captured, not lost: senses other groups' robots and no own one, or is also inside their convex hull (3.3)."""
 
     sectors: int = 8
     """q, the number of sectors per sensing region and of headings (not given in the text)."""

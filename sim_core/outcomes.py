@@ -6,7 +6,7 @@ Where two hold in one step, the first of collision, goal, lost or captured, time
 
 M_sensor fails as soon as the learning robot senses no own robot, M_IN and M_OUT once it has been outside its
 group's ellipse for phi steps. A robot that fails so is captured if it senses, within R2, robots of other groups
-and none of its own; else it is lost.
+and none of its own; else it is lost. With `captured_is = surrounded` those others must also stand around it.
 """
 
 from __future__ import annotations
@@ -80,19 +80,44 @@ def collision_or_goal(robot, robots, pos_x, pos_y, goal_x, goal_y, collision_sq,
 
 
 @kernel
-def lost_or_captured(robot, robots, pos_x, pos_y, range_sq):
-    """How a robot fails that was outside its group's ellipse for too long."""
-    own, others = sensed(robot, robots, pos_x, pos_y, range_sq)
-    return _CAPTURED if own == 0 and others > 0 else _LOST
+def _all_on_one_side(robot, edge, pos_x, pos_y, range_sq):
+    """Whether no sensed robot is to the right of the line from `robot` through the robot `edge`."""
+    edge_x, edge_y = pos_x[edge] - pos_x[robot], pos_y[edge] - pos_y[robot]
+    for other in range(pos_x.shape[0]):
+        dx, dy = pos_x[other] - pos_x[robot], pos_y[other] - pos_y[robot]
+        if dx * dx + dy * dy < range_sq and edge_x * dy - edge_y * dx < 0.0:
+            return False
+    return True
 
 
 @kernel
-def end_of_step(robot, robots, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m):
+def surrounded(robot, pos_x, pos_y, range_sq):
+    """Whether a robot stands inside the convex hull of those that it senses: none of them is the hull's edge to it."""
+    nobody = True
+    for other in range(pos_x.shape[0]):
+        dx, dy = pos_x[other] - pos_x[robot], pos_y[other] - pos_y[robot]
+        if other != robot and dx * dx + dy * dy < range_sq:
+            nobody = False
+            if _all_on_one_side(robot, other, pos_x, pos_y, range_sq):
+                return False
+    return not nobody
+
+
+@kernel
+def lost_or_captured(robot, robots, pos_x, pos_y, range_sq, must_surround):
+    """How a robot fails that is away from its group; `must_surround` as `captured_is` has it."""
+    own, others = sensed(robot, robots, pos_x, pos_y, range_sq)
+    if own > 0 or others == 0 or (must_surround and not surrounded(robot, pos_x, pos_y, range_sq)):
+        return _LOST
+    return _CAPTURED
+
+
+@kernel
+def end_of_step(robot, robots, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m, must_surround):
     """Outcome of one world after a step of a robot that is lost once it senses no own robot."""
     ended = collision_or_goal(robot, robots, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m)
     if ended != _RUNNING:
         return ended
-    own, others = sensed(robot, robots, pos_x, pos_y, range_m * range_m)
-    if own == 0:
-        return _CAPTURED if others > 0 else _LOST
-    return _RUNNING
+    range_sq = range_m * range_m
+    own, _ = sensed(robot, robots, pos_x, pos_y, range_sq)
+    return lost_or_captured(robot, robots, pos_x, pos_y, range_sq, must_surround) if own == 0 else _RUNNING

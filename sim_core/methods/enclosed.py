@@ -60,6 +60,7 @@ class EnclosedParams(NamedTuple):
     outer_m: Any
     outer_sq: Any
     collision_sq: Any
+    must_surround: bool
     outside_limit_steps: int
     horizon_steps: int
     timeout_fails: bool
@@ -130,7 +131,7 @@ def _outcome(state, out, params):
         robots = p.ellipse.robots
         ended = collision_or_goal(learner, robots, pos_x, pos_y, goal_x, goal_y, p.collision_sq, p.outer_m)
         if ended == _RUNNING and state.outside_steps[world] >= p.outside_limit_steps:
-            ended = lost_or_captured(learner, robots, pos_x, pos_y, p.outer_sq)
+            ended = lost_or_captured(learner, robots, pos_x, pos_y, p.outer_sq, p.must_surround)
         if ended == _RUNNING and state.steps[world] >= p.horizon_steps:
             ended = _TIMEOUT
         out[world] = ended
@@ -193,6 +194,7 @@ class EnclosedMethod(Method):
                 outer_m=real(config.outer_radius_m),
                 outer_sq=real(config.outer_radius_m) ** 2,
                 collision_sq=real(2 * config.robot_radius_m) ** 2,
+                must_surround=config.captured_is == "surrounded",
                 outside_limit_steps=config.outside_limit_steps,
                 horizon_steps=config.horizon_steps,
                 timeout_fails=config.timeout_fails,

@@ -39,6 +39,7 @@ class SensorParams(NamedTuple):
     outer_sq: Any
     outer_m: Any
     collision_sq: Any
+    must_surround: bool
     horizon_steps: int
     reward_scale: float
     clock_is_step: bool
@@ -99,6 +100,7 @@ def _outcome(state, out, params):
             state.goal_y[world],
             p.collision_sq,
             p.outer_m,
+            p.must_surround,
         )
         if ended == _RUNNING and state.steps[world] >= p.horizon_steps:
             ended = _TIMEOUT
@@ -141,6 +143,7 @@ class SensorMethod(Method):
                 outer_sq=real(config.outer_radius_m) ** 2,
                 outer_m=real(config.outer_radius_m),
                 collision_sq=real(2 * config.robot_radius_m) ** 2,
+                must_surround=config.captured_is == "surrounded",
                 horizon_steps=config.horizon_steps,
                 reward_scale=float(config.reward_scale),
                 clock_is_step=config.reward_clock == "step",

@@ -229,6 +229,17 @@ def test_lost_and_captured_at_phi(at, others, expected, make_state):
     assert reward == pytest.approx(0.01 if expected is Outcome.RUNNING else -1.0)
 
 
+AROUND_6 = [(6.5, 0.5), (6.5, -0.5), (5.3, 0), *AWAY[3:]]
+
+
+@pytest.mark.parametrize("method", ["sensor", *METHOD_NAMES])
+@pytest.mark.parametrize(("others", "expected"), [(NEAR_6, Outcome.LOST), (AROUND_6, Outcome.CAPTURED)])
+def test_captured_among_others_or_surrounded_by_them(method, others, expected, make_state):
+    for captured_is, outcome in (("among", Outcome.CAPTURED), ("surrounded", expected)):
+        config, state = scene(make_state, (6, 0), others, method, outside_limit_steps=1, captured_is=captured_is)
+        assert step(config, state)[0] is outcome
+
+
 def test_an_own_robot_in_sight_is_not_captured(make_state):
     config, state = scene(make_state, (0, 0), AWAY, outside_limit_steps=1, ellipse_axes="printed")
     state.pos_x[0, 0], state.pos_y[0, 0] = 2.0, 1.0  # half-axes of 1.41, a mate at 1 m

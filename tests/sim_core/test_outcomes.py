@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 from sim_core.outcomes import (
     ENDED,
@@ -13,6 +14,7 @@ from sim_core.outcomes import (
     group_goal_distance_m,
     lost_or_captured,
     sensed,
+    surrounded,
 )
 
 REAL = np.float32
@@ -21,17 +23,17 @@ FAR = 50.0
 ROBOT, MATE, OTHER_A, OTHER_B = range(4)
 
 
-def outcome(pos, goal=(FAR, FAR), robot=ROBOT):
+def outcome(pos, goal=(FAR, FAR), robot=ROBOT, must_surround=False):
     """Outcome of two groups of two (robots 0, 1 and 2, 3)."""
     pos_x, pos_y = np.ascontiguousarray(np.asarray(pos, REAL).T)
     goal_x, goal_y = np.array([goal[0], -FAR], REAL), np.array([goal[1], -FAR], REAL)
     contact_sq = REAL(CONTACT_M) ** 2
-    return Outcome(end_of_step(robot, 2, pos_x, pos_y, goal_x, goal_y, contact_sq, REAL(RANGE_M)))
+    return Outcome(end_of_step(robot, 2, pos_x, pos_y, goal_x, goal_y, contact_sq, REAL(RANGE_M), must_surround))
 
 
 ALONE = [(0, 0), (9, 0), (0, 9), (0, -9)]
 TOGETHER = [(0, 0), (1.0, 0), (0, 9), (0, -9)]
-SURROUNDED = [(0, 0), (9, 0), (1.0, 0), (0, -9)]
+AMONG = [(0, 0), (9, 0), (1.0, 0), (0, -9)]
 MIXED = [(0, 0), (1.0, 0), (-1.0, 0), (0, 1.2)]
 
 
@@ -39,7 +41,7 @@ def test_each_outcome():
     assert outcome(TOGETHER) is Outcome.RUNNING
     assert outcome(MIXED) is Outcome.RUNNING
     assert outcome(ALONE) is Outcome.LOST
-    assert outcome(SURROUNDED) is Outcome.CAPTURED
+    assert outcome(AMONG) is Outcome.CAPTURED
     assert outcome([(0, 0), (0.19, 0), (0, 9), (0, -9)]) is Outcome.COLLISION
     assert outcome([(0, 0), (1.0, 0), (0, 0.19), (0, -9)]) is Outcome.COLLISION
     assert outcome(TOGETHER, goal=(0.5, 0)) is Outcome.GOAL
@@ -119,9 +121,62 @@ def test_sensing_and_contact_match_numpy():
 
 
 def test_lost_or_captured():
-    for pos, expected in ((ALONE, "LOST"), (TOGETHER, "LOST"), (MIXED, "LOST"), (SURROUNDED, "CAPTURED")):
+    for pos, expected in ((ALONE, "LOST"), (TOGETHER, "LOST"), (MIXED, "LOST"), (AMONG, "CAPTURED")):
         pos_x, pos_y = np.ascontiguousarray(np.asarray(pos, REAL).T)
-        assert lost_or_captured(ROBOT, 2, pos_x, pos_y, REAL(RANGE_M) ** 2) == Outcome[expected]
+        assert lost_or_captured(ROBOT, 2, pos_x, pos_y, REAL(RANGE_M) ** 2, False) == Outcome[expected]
+
+
+THREE_AROUND = [(1.0, -0.5), (-1.0, -0.5), (0, 1.0)]
+"""Robots whose hull holds the origin."""
+
+
+def learner_and(others):
+    """Positions of a group of three at the origin, its mates far away, and of a group of three others."""
+    return np.ascontiguousarray(np.array([(0, 0), (FAR, 0), (0, FAR), *others], REAL).T)
+
+
+@pytest.mark.parametrize(
+    ("others", "expected"),
+    [
+        (THREE_AROUND, "CAPTURED"),
+        ([(x, y + 0.75) for x, y in THREE_AROUND], "LOST"),  # all above it
+        ([(2 * x, 2 * y) for x, y in THREE_AROUND], "LOST"),  # too far to be sensed
+        ([*THREE_AROUND[:2], (0, 9.0)], "LOST"),  # the third is
+        ([(1.0, 0), (-1.0, 0), (9.0, 9.0)], "LOST"),  # between two, on the edge of their hull
+        ([(FAR, 9), (FAR, 8), (FAR, 7)], "LOST"),
+    ],
+)
+def test_captured_may_have_to_be_surrounded(others, expected):
+    pos_x, pos_y = learner_and(others)
+    assert lost_or_captured(0, 3, pos_x, pos_y, REAL(RANGE_M) ** 2, True) == Outcome[expected]
+    goal = np.array([FAR, -FAR], REAL)
+    ended = end_of_step(0, 3, pos_x, pos_y, goal, goal, REAL(CONTACT_M) ** 2, REAL(RANGE_M), True)
+    assert ended == Outcome[expected]
+
+
+def test_who_senses_an_own_robot_is_not_captured_among_others_all_around():
+    pos_x, pos_y = learner_and(THREE_AROUND)
+    pos_x[1] = 1.2
+    assert lost_or_captured(0, 3, pos_x, pos_y, REAL(RANGE_M) ** 2, True) == Outcome.LOST
+
+
+def inside_hull(point, corners):
+    """Whether the point is a convex combination of the corners."""
+    if not len(corners):
+        return False
+    system = np.vstack([np.asarray(corners, np.float64).T, np.ones(len(corners))])
+    return linprog(np.zeros(len(corners)), A_eq=system, b_eq=[*point, 1.0]).success
+
+
+def test_surrounded_is_inside_the_convex_hull():
+    rng = np.random.default_rng(2)
+    found = []
+    for _ in range(300):
+        pos = rng.uniform(-0.9, 0.9, (int(rng.integers(1, 20)), 2)).astype(REAL)
+        near = [p for p in pos[1:] if np.sum((p - pos[0]) ** 2) < REAL(1)]
+        found.append(surrounded(0, *np.ascontiguousarray(pos.T), REAL(1)))
+        assert found[-1] == inside_hull(pos[0], near)
+    assert 50 < sum(found) < 250
 
 
 def test_collision_or_goal_knows_nothing_of_lost():
