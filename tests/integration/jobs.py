@@ -3,11 +3,21 @@
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import psutil
 
 from tests.integration.conftest import clean_environment
+
+
+def wait_for(condition: Callable[[], bool], log: Callable[[], str], process: subprocess.Popen) -> None:
+    """Waits until the condition holds; fails with the log when the process ends before, or after four minutes."""
+    deadline_s = time.monotonic() + 240
+    while not condition():
+        assert process.poll() is None, log()
+        assert time.monotonic() < deadline_s, log()
+        time.sleep(0.05)
 
 
 class Job:
@@ -25,15 +35,18 @@ class Job:
                 stderr=subprocess.STDOUT,
             )
 
+    def wait_for(self, condition: Callable[[], bool]) -> None:
+        wait_for(condition, self.log.read_text, self.process)
+
     def wait_for_files(self, pattern: str, count: int) -> None:
         """Waits until files of `count` different names under the folder have been seen while the job runs."""
         seen: set[Path] = set()
-        deadline_s = time.monotonic() + 240
-        while len(seen) < count:
-            assert self.process.poll() is None, self.log.read_text()
-            assert time.monotonic() < deadline_s, self.log.read_text()
-            seen |= {path for path in self.folder.glob(pattern) if path.suffix != ".part"}
-            time.sleep(0.05)
+
+        def enough() -> bool:
+            seen.update(path for path in self.folder.glob(pattern) if path.suffix != ".part")
+            return len(seen) >= count
+
+        self.wait_for(enough)
 
     def wait_for_checkpoints(self, run: str, count: int) -> None:
         self.wait_for_files(f"runs/{run}/checkpoints/step-*", count)

@@ -16,6 +16,7 @@ import requests
 
 from learner.config import RunConfig
 from tests.integration.conftest import clean_environment, flags
+from tests.integration.jobs import wait_for
 
 ROOT = Path(__file__).parents[2]
 HEAD_PORTS = ("port", "dashboard-port", "ray-client-server-port")
@@ -52,12 +53,14 @@ def answers(url: str) -> bool:
         return False
 
 
-def wait_for(condition, log, process: subprocess.Popen) -> None:
-    deadline_s = time.monotonic() + 240
-    while not condition():
-        assert process.poll() is None, log()
-        assert time.monotonic() < deadline_s, log()
-        time.sleep(0.2)
+@contextmanager
+def short_folder() -> Iterator[Path]:
+    """A folder for Ray's sockets, whose paths must be short."""
+    folder = Path(tempfile.mkdtemp(prefix="sh", dir="/tmp"))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 LOOPBACK = ("--node-ip-address=127.0.0.1",)
@@ -110,35 +113,33 @@ def end(process: subprocess.Popen) -> None:
 @contextmanager
 def running_head(log: Path, *words: str) -> Iterator[Head]:
     """A head node; it is started again where Ray's own 30 s for it were too short on a busy machine."""
-    folder = Path(tempfile.mkdtemp(prefix="sh", dir="/tmp"))  # short: Ray's sockets lie in it
-    for _ in range(3):
-        process, ports = start_head(folder, log, *words)
-        if process.poll() is None or "timed out during startup" not in log.read_text():
-            break
-    assert process.poll() is None, log.read_text()
-    address = f"http://127.0.0.1:{ports['dashboard-port']}"
-    try:
-        wait_for(lambda: answers(f"{address}/api/jobs/"), log.read_text, process)
-        yield Head(address, f"127.0.0.1:{ports['port']}", folder / "session_latest")
-    finally:
-        end(process)
-        shutil.rmtree(folder, ignore_errors=True)
+    with short_folder() as folder:
+        for _ in range(3):
+            process, ports = start_head(folder, log, *words)
+            if process.poll() is None or "timed out during startup" not in log.read_text():
+                break
+        assert process.poll() is None, log.read_text()
+        address = f"http://127.0.0.1:{ports['dashboard-port']}"
+        try:
+            wait_for(lambda: answers(f"{address}/api/jobs/"), log.read_text, process)
+            yield Head(address, f"127.0.0.1:{ports['port']}", folder / "session_latest")
+        finally:
+            end(process)
 
 
 @contextmanager
 def joined_node(head: Head, log: Path, *words: str) -> Iterator[subprocess.Popen]:
     """Another node of the head's cluster, with a folder of its own: in a shared one, nodes delete each other's code."""
-    folder = Path(tempfile.mkdtemp(prefix="sh", dir="/tmp"))
-    ports = with_free_ports(*NODE_PORTS)
-    words = (f"--address={head.gcs}", *LOOPBACK, f"--temp-dir={folder}", *words)
-    node = ray_start(log, *words, *as_flags(ports), auth=NO_TOKEN)
-    assert node.poll() is None, log.read_text()
-    try:
-        yield node
-    finally:
-        if node.poll() is None:
-            end(node)
-        shutil.rmtree(folder, ignore_errors=True)
+    with short_folder() as folder:
+        ports = with_free_ports(*NODE_PORTS)
+        words = (f"--address={head.gcs}", *LOOPBACK, f"--temp-dir={folder}", *words)
+        node = ray_start(log, *words, *as_flags(ports), auth=NO_TOKEN)
+        assert node.poll() is None, log.read_text()
+        try:
+            yield node
+        finally:
+            if node.poll() is None:
+                end(node)
 
 
 def kill(node: subprocess.Popen) -> None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-import time
 
 import mlflow
 import pytest
@@ -29,24 +28,17 @@ def server(tmp_path):
     made.kill()
 
 
-def wait_until(condition, job):
-    deadline_s = time.monotonic() + 200
-    while not condition():
-        assert time.monotonic() < deadline_s, job.log.read_text()
-        time.sleep(0.1)
-
-
 def test_metrics_of_an_outage_of_mlflow_arrive_later_and_once(server, tmp_path):
     config = dataclasses.replace(SMALL, total_env_steps=30_000)
     job = Job(tmp_path, "train", "--name", "r", "--tracking-uri", server.uri, *flags(config))
     folder = RunFolder(tmp_path / "runs" / "r")
     try:
-        wait_until(lambda: PushedMark.value(folder.pushed) > 0, job)
+        job.wait_for(lambda: PushedMark.value(folder.pushed) > 0)
         server.kill()
         delivered = PushedMark.value(folder.pushed)
-        wait_until(lambda: "training done" in job.log.read_text(), job)  # nobody waited for the server
+        job.wait_for(lambda: "training done" in job.log.read_text())  # nobody waited for the server
         assert PushedMark.value(folder.pushed) == delivered < folder.journal.stat().st_size
-        wait_until(lambda: "MLflow does not take the metrics" in job.log.read_text(), job)  # its client has tried
+        job.wait_for(lambda: "MLflow does not take the metrics" in job.log.read_text())  # its client has tried
         server.start()
         assert job.process.wait(200) == 0, job.log.read_text()
     finally:

@@ -3,10 +3,8 @@
 import dataclasses
 import json
 import secrets
-import shutil
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import pytest
@@ -15,8 +13,9 @@ from deploy.chaos_checks import complaints
 from learner.fault_log import read_faults
 from learner.run_folder import RunFolder
 from tests.integration.conftest import SMALL, clean_environment, flags
+from tests.integration.jobs import wait_for
 from tests.integration.machines import SlowCable, at, machines
-from tests.integration.ray_head import ROOT, end, kill, ray_start, wait_for, with_token
+from tests.integration.ray_head import ROOT, end, kill, ray_start, short_folder, with_token
 
 pytestmark = [
     pytest.mark.ray,
@@ -83,14 +82,12 @@ class Cluster:
 @pytest.fixture
 def wired():
     """(the cluster, its cable)."""
-    folder = Path(tempfile.mkdtemp(prefix="sh", dir="/tmp"))  # short: Ray's sockets lie in it
-    with machines("head", "far") as (head, far):
+    with short_folder() as folder, machines("head", "far") as (head, far):
         cable = SlowCable(head, HEAD, far, FAR, DELAY_MS)
         cluster = Cluster(head, far, folder)
         yield cluster, cable
         cluster.close()
         cable.close()
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 def wait_for_steps(folder: RunFolder, env_steps: int, job: subprocess.Popen, log: Path) -> None:

@@ -9,7 +9,6 @@ import re
 import secrets
 import shutil
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +16,7 @@ from typing import NamedTuple
 import pytest
 
 from tests.integration.machines import at, connect, machines, on, root
-from tests.integration.ray_head import ROOT, copy_of_the_code, end, ray_start, with_token
+from tests.integration.ray_head import ROOT, copy_of_the_code, end, ray_start, short_folder, with_token
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(600)]
 
@@ -71,15 +70,15 @@ def trio() -> Iterator[Machines]:
 @pytest.fixture(scope="module")
 def token(trio) -> Iterator[str]:
     """The token of a head that listens on all interfaces, before its firewall stands."""
-    folder = Path(tempfile.mkdtemp(prefix="sh", dir="/tmp"))  # short: Ray's sockets lie in it
     secret = secrets.token_hex(32)
-    words = ["--head", f"--node-ip-address={HEAD}", "--dashboard-host=0.0.0.0", f"--temp-dir={folder}", "--num-cpus=1"]
+    words = ["--head", f"--node-ip-address={HEAD}", "--dashboard-host=0.0.0.0", "--num-cpus=1"]
     words += [f"--metrics-export-port={METRICS}", f"--dashboard-port={DASHBOARD}"]
-    process = ray_start(folder / "log", *words, auth=with_token(secret), before=at(trio.head))
-    assert process.poll() is None, (folder / "log").read_text()
-    yield secret
-    end(process)
-    shutil.rmtree(folder, ignore_errors=True)
+    with short_folder() as folder:
+        log = folder / "log"
+        process = ray_start(log, *words, f"--temp-dir={folder}", auth=with_token(secret), before=at(trio.head))
+        assert process.poll() is None, log.read_text()
+        yield secret
+        end(process)
 
 
 @pytest.fixture

@@ -13,7 +13,8 @@ import pytest
 
 from learner.checkpoint import newest_valid
 from tests.integration.conftest import SMALL, clean_environment
-from tests.integration.ray_head import NO_TOKEN, Head, copy_of_the_code, finish, running_head, submit, wait_for
+from tests.integration.jobs import wait_for
+from tests.integration.ray_head import NO_TOKEN, Head, copy_of_the_code, finish, running_head, submit
 
 pytestmark = [
     pytest.mark.ray,

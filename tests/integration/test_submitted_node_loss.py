@@ -10,7 +10,8 @@ from deploy.chaos_checks import complaints
 from learner.fault_log import read_faults
 from learner.run_folder import RunFolder
 from tests.integration.conftest import SMALL
-from tests.integration.ray_head import copy_of_the_code, finish, joined_node, kill, running_head, submit, wait_for
+from tests.integration.jobs import wait_for
+from tests.integration.ray_head import copy_of_the_code, finish, joined_node, kill, running_head, submit
 
 pytestmark = [
     pytest.mark.ray,
