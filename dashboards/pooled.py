@@ -1,23 +1,24 @@
 """The table of results as cells: counts pooled over training seeds, and quantities made of several cells' rates.
 
-Rates have Wilson intervals on the pooled counts. They speak of the policies that were trained: how much another
-training seed would change is shown beside them, as the lowest and the highest rate of a seed.
+Rates have Wilson intervals on the pooled counts. Where several training seeds stand behind a rate, its interval also
+holds what another seed would change: counts of different seeds vary far more than those of one policy's episodes, by a
+factor that is estimated over the cells of one method and as many robots. With one seed it speaks of that policy alone.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from actors import estimates
-from actors.estimates import Estimate
+from actors.estimates import BINOMIAL, Dispersion, Estimate, dispersion
 from actors.result_table import GROUPS, LEARNED, ROBOTS, ResultRow
 from sim_core.checks import require
-from sim_core.outcomes import Outcome
+from sim_core.outcomes import ENDED, Outcome
 
 METHOD_NAMES = {"sensor": "M_sensor", "in": "M_IN", "out": "M_OUT"}
 """The methods by their name in a table; printed in this order."""
@@ -55,6 +56,7 @@ class Cell:
     """All evaluations of one method, trained in one setup and played in one, a row a training seed."""
 
     rows: tuple[ResultRow, ...]
+    spread: Mapping[Outcome, Dispersion] = field(default_factory=dict)
 
     @property
     def episodes(self) -> int:
@@ -69,7 +71,7 @@ class Cell:
         """How often an episode ends in `outcome`."""
         per_seed = [row.count(outcome) / row.episodes for row in self.rows]
         return Measured(
-            estimate=rate(self.count(outcome), self.episodes),
+            estimate=rate(self.count(outcome), self.episodes, self._spread(outcome)),
             episodes=self.episodes,
             seeds=len(self.rows),
             seed_range=(min(per_seed), max(per_seed)) if len(per_seed) > 1 else None,
@@ -78,7 +80,10 @@ class Cell:
     def failures(self) -> Measured:
         """How often an episode does not end in the goal, for whatever reason."""
         failed = self.episodes - self.count(Outcome.GOAL)
-        return Measured(rate(failed, self.episodes), self.episodes, len(self.rows))
+        return Measured(rate(failed, self.episodes, self._spread(Outcome.GOAL)), self.episodes, len(self.rows))
+
+    def _spread(self, outcome: Outcome) -> Dispersion:
+        return self.spread.get(outcome, BINOMIAL) if len(self.rows) > 1 else BINOMIAL
 
     def lost_less_captured(self) -> Measured:
         """Share of lost episodes less that of captured ones.
@@ -98,6 +103,16 @@ class Cell:
 def _joined(first: float, second: float, correlation: float) -> float:
     """Half-width of a difference from those of its terms, whose estimates correlate."""
     return float(np.sqrt(max(first**2 + second**2 - 2 * correlation * first * second, 0.0)))
+
+
+def _spread_over_seeds(cells: Sequence[Sequence[ResultRow]]) -> dict[Outcome, Dispersion]:
+    """How much the counts of cells, each a row a seed, vary over seeds; one policy in many setups is one seed."""
+    policies = {(row.trained_robots, row.trained_groups, row.seed) for rows in cells for row in rows}
+    freedom = len(policies) - len({policy[:2] for policy in policies})
+    return {
+        outcome: dispersion([[(row.count(outcome), row.episodes) for row in rows] for rows in cells], freedom)
+        for outcome in ENDED
+    }
 
 
 class Results:
@@ -120,7 +135,14 @@ class Results:
                 f"the results count {method} trained in {trained} and played in {played} twice for one seed; "
                 "make the table again",
             )
-        self._cells = {key: Cell(tuple(same)) for key, same in found.items()}
+        kin: dict[tuple[str, int, bool], list[list[ResultRow]]] = {}
+        for (method, trained, played), same in found.items():
+            kin.setdefault((method, trained.robots, trained == played), []).append(same)
+        spreads = {key: _spread_over_seeds(cells) for key, cells in kin.items()}
+        self._cells = {
+            (method, trained, played): Cell(tuple(same), spreads[method, trained.robots, trained == played])
+            for (method, trained, played), same in found.items()
+        }
 
     def fixed(self, method: str, setup: Setup) -> Cell | None:
         """The cell trained and played in `setup`, None if it is missing."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from actors.estimates import mean, rate, rate_difference
+from actors.estimates import BINOMIAL, Dispersion, dispersion, mean, rate, rate_difference
 
 
 def wilson(count, total):
@@ -69,3 +69,23 @@ def test_differences_against_published_numbers():
 def test_a_difference_turned_round_changes_its_sign():
     forth, back = rate_difference((7, 30), (50, 90)), rate_difference((50, 90), (7, 30))
     assert forth == pytest.approx((-back.value, -back.high, -back.low))
+
+
+def test_counts_that_vary_more_are_worth_fewer_trials():
+    assert rate(300, 1000, Dispersion(5.0)) == pytest.approx(rate(60, 200))
+    wide = stats.t.ppf(0.975, 4) / stats.norm.ppf(0.975)
+    few, many = (rate(50_000, 100_000, Dispersion(1.0, freedom)) for freedom in (4, math.inf))
+    assert few.high - few.low == pytest.approx(wide * (many.high - many.low), rel=1e-3)
+
+
+def test_dispersion_is_pearsons_chi_square_of_the_table():
+    samples = [[(10, 100), (30, 100)], [(5, 50), (9, 80), (20, 90)]]
+    tables = [np.array([(count, total - count) for count, total in pairs]) for pairs in samples]
+    chi_square = sum(stats.chi2_contingency(table, correction=False).statistic for table in tables)
+    assert dispersion(samples) == pytest.approx((chi_square / 3, 3))
+    assert dispersion(samples, freedom=2) == pytest.approx((chi_square / 3, 2))
+
+
+@pytest.mark.parametrize("samples", [[], [[(3, 10)]], [[(0, 10), (0, 20)], [(10, 10), (5, 5)]], [[(5, 10), (5, 10)]]])
+def test_what_does_not_vary_is_binomial(samples):
+    assert dispersion(samples) == BINOMIAL

@@ -38,7 +38,7 @@ def test_seeds_are_pooled_by_their_counts():
     assert cell is not None
     assert (cell.episodes, cell.count(Outcome.GOAL)) == (4000, 2700 + 600)
     measured = success(cell)
-    assert measured.estimate == rate(3300, 4000)
+    assert measured.estimate.value == 3300 / 4000
     assert (measured.seeds, measured.seed_range) == (2, (0.6, 0.9))
     assert cell.failures().estimate.value == pytest.approx(700 / 4000)
 
@@ -46,6 +46,37 @@ def test_seeds_are_pooled_by_their_counts():
 def test_one_seed_has_no_range():
     cell = Results([row("sensor", HOME, success=90)]).fixed("sensor", HOME)
     assert cell is not None and success(cell).seed_range is None
+
+
+def test_intervals_over_seeds_cover_the_method_not_these_policies():
+    """Policies whose true rates differ by 5 points: a rate's interval holds the mean of all that could be trained."""
+    rng, truth, cells, hits, binomial = np.random.default_rng(2), 0.8, 5, 0, 0
+    for _ in range(300):
+        rows = [
+            row("out", Setup(5, groups), success=100 * rng.binomial(3000, share) / 3000, seed=seed)
+            for groups in GROUPS
+            for seed, share in enumerate(rng.normal(truth, 0.05, 3).clip(0, 1))
+        ]
+        results = Results(rows)
+        for groups in GROUPS:
+            cell = results.fixed("out", Setup(5, groups))
+            assert cell is not None
+            estimate, naive = success(cell).estimate, rate(cell.count(Outcome.GOAL), cell.episodes)
+            hits += estimate.low <= truth <= estimate.high
+            binomial += naive.low <= truth <= naive.high
+    assert 0.935 <= hits / (300 * cells) <= 0.965
+    assert binomial / (300 * cells) < 0.4
+
+
+def test_one_method_does_not_widen_another():
+    rows = [row("sensor", HOME, success=90, seed=seed) for seed in (0, 1)]
+    rows += [row("out", HOME, success=success_percent, seed=seed) for seed, success_percent in enumerate((95, 50))]
+    results = Results(rows)
+    steady, shaky = (results.fixed(method, HOME) for method in ("sensor", "out"))
+    assert steady is not None and shaky is not None
+    assert success(steady).estimate == rate(5400, 6000)
+    assert success(shaky).estimate.low < 0.4
+    assert shaky.failures().estimate.high == pytest.approx(1 - success(shaky).estimate.low)
 
 
 def test_cells_are_told_apart_by_method_training_and_setup():
