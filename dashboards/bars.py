@@ -17,7 +17,7 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import MultipleLocator, PercentFormatter
 
 from dashboards.pictures import MUTED, TEXT, dress, plain
 from dashboards.pooled import Measured
@@ -81,7 +81,14 @@ def draw_lines(axes: Axes, panel: Panel, top: float) -> None:
             _interval(axes, label + offset, rate, series.colour)
         _printed(axes, series, offset)
     _finish(axes, panel)
+    axes.yaxis.set_major_locator(_whole_percents(top))
     axes.set_ylim(0.0, top)
+
+
+def _whole_percents(top: float) -> MultipleLocator:
+    """Ticks at whole percents, at most seven: what a tick says is where it stands."""
+    step = next(step for step in (1, 2, 5, 10, 20) if 100 * top / step <= 7)
+    return MultipleLocator(step / 100)
 
 
 def _present(series: Series) -> Iterator[tuple[int, Measured]]:

@@ -20,7 +20,8 @@ from matplotlib.patches import Circle, Ellipse, Wedge
 from numpy.typing import NDArray
 
 from dashboards.pictures import GRID, MUTED, TEXT, new_figure
-from sim_core.config import WorldConfig
+from dashboards.pooled import Setup
+from sim_core.config import MethodName, WorldConfig
 from sim_core.methods.apf import field_of, field_params
 from sim_core.methods.ellipse import ellipse_params, group_ellipse, left_out_of
 from sim_core.methods.headings import heading_velocities
@@ -29,8 +30,8 @@ from sim_core.outcomes import Outcome
 from sim_core.render import GROUP_COLOURS
 from sim_core.worlds import WorldBatch
 
-SENSOR_WORLD = WorldConfig(robots=10, groups=3, method="sensor")
-OUTSIDE_WORLD = WorldConfig(robots=10, groups=3, method="out")
+DRAWN_SETUP = Setup(10, 3)
+"""Robots per group, and groups, of the worlds that are drawn."""
 HEADING, FIELD, SUM = "#1C2024", "#D55E00", "#0072B2"
 EPISODE_SEED = 3
 
@@ -82,11 +83,20 @@ def potential_field(worlds: WorldBatch) -> Vector:
     return np.array(field, np.float64)
 
 
-def net_counts(worlds: WorldBatch) -> NDArray[np.int64]:
-    """What M_sensor perceives in world 0: own less other robots `[2, sectors]`, the disc's first."""
+def perceived(worlds: WorldBatch) -> NDArray[np.int64]:
+    """What M_sensor perceives in world 0, `[kinds, 2, sectors]`, the disc's first.
+
+    One kind, own less other robots, or both counts apart where `sensor_counts` says so.
+    """
     seen = np.zeros((worlds.num_worlds, *worlds.method.observation_shape), worlds.method.observation_dtype)
     worlds.method.perceive(worlds.state, np.ones(worlds.num_worlds, np.bool_), seen)
-    return np.array(seen[0].reshape(2, worlds.config.sectors), np.int64)
+    return np.array(seen[0].reshape(-1, 2, worlds.config.sectors), np.int64)
+
+
+def net_counts(worlds: WorldBatch) -> NDArray[np.int64]:
+    """Own less other robots of world 0 `[2, sectors]`, the disc's first."""
+    own, *others = perceived(worlds)
+    return own - others[0] if others else own
 
 
 def group_ellipses(worlds: WorldBatch, config: WorldConfig) -> list[GroupEllipse]:
@@ -103,10 +113,10 @@ def executed_velocity(worlds: WorldBatch, action: int) -> Vector:
     return np.array([out_x[0], out_y[0]], np.float64)
 
 
-def diagram_3_1() -> Figure:
+def diagram_3_1(world: WorldConfig) -> Figure:
     """M_sensor's regions with the robots in them, and the state they make with the heading of the fullest sector."""
-    worlds = best_scene(SENSOR_WORLD, EPISODE_SEED, robots_near)
-    counts = net_counts(worlds)
+    worlds = best_scene(world, EPISODE_SEED, robots_near)
+    counts = perceived(worlds)
     figure = new_figure(9.0, 5.0, f"Figure 3.1  What M_sensor perceives (step {int(worlds.state.steps[0])})")
     left, right = figure.subplots(1, 2)
     config = worlds.config
@@ -116,15 +126,16 @@ def diagram_3_1() -> Figure:
     _draw_robots(right, worlds, reach_m=config.outer_radius_m + 0.25, opacity=0.25)
     _draw_regions(right, config, filled=False)
     _draw_counts(right, config, counts)
-    action = int(np.argmax(counts.sum(axis=0)))
+    action = int(np.argmax(net_counts(worlds).sum(axis=0)))
     _arrow(right, executed_velocity(worlds, action) * 0.9 * config.outer_radius_m, HEADING)
-    right.set_title(f"(b) own less other robots per sector; heading {action}", **_TITLE)
+    state = "own less other" if len(counts) == 1 else "own | other"
+    right.set_title(f"(b) {state} robots per sector; heading {action}", **_TITLE)
     return figure
 
 
-def diagram_4_1() -> Figure:
+def diagram_4_1(world: WorldConfig) -> Figure:
     """The groups' ellipses with a, b and theta: as the text has them, and with the whole covariance."""
-    worlds = best_scene(OUTSIDE_WORLD, EPISODE_SEED, robots_near)
+    worlds = best_scene(world, EPISODE_SEED, robots_near)
     counted = "counted" if worlds.config.ellipse_counts_learner else "not counted"
     steps = int(worlds.state.steps[0])
     title = f"Figures 4.1 and 4.2  Groups as ellipses, the learning robot (black) {counted} (step {steps})"
@@ -142,16 +153,17 @@ def diagram_4_1() -> Figure:
     return figure
 
 
-def diagram_4_3() -> Figure:
+def diagram_4_3(world: WorldConfig) -> Figure:
     """M_OUT's velocity as the sum of the network's and the potential field's."""
-    worlds = best_scene(OUTSIDE_WORLD, EPISODE_SEED, field_strength)
+    worlds = best_scene(world, EPISODE_SEED, field_strength)
     config = worlds.config
     action = _heading_to_group(worlds)
     network, field = heading_velocities(config, np.float64)[action], potential_field(worlds)
     moved = executed_velocity(worlds, action)
     figure = new_figure(6.4, 5.4, f"Figure 4.3  u_l = u_nn + u_apf (step {int(worlds.state.steps[0])})")
     axes = figure.subplots()
-    _draw_robots(axes, worlds, reach_m=1.25)
+    farthest = max(float(np.abs(tip).max()) for tip in (network, field, network + field))
+    _draw_robots(axes, worlds, reach_m=max(1.25, farthest + 0.15))
     axes.add_patch(Circle((0, 0), config.apf_range_m, fill=False, ls=":", ec=MUTED))
     for tail, tip in ((network, network + field), (field, network + field)):
         axes.plot(*zip(tail, tip, strict=True), color=MUTED, ls="--", lw=1)
@@ -216,16 +228,21 @@ def _draw_regions(axes: Axes, config: WorldConfig, filled: bool) -> None:
 
 
 def _draw_counts(axes: Axes, config: WorldConfig, counts: NDArray[np.int64]) -> None:
-    """Each cell's count `[2, sectors]` in its middle."""
+    """Each cell's count in its middle, or both with a bar between; `[kinds, 2, sectors]`."""
     middle_m = (0.62 * config.inner_radius_m, 0.5 * (config.inner_radius_m + config.outer_radius_m))
     centres = heading_velocities(config, np.float64)[: config.sectors] / config.learner_speed_m_s
-    for radius_m, line in zip(middle_m, counts, strict=True):
-        for centre, count in zip(centres, line, strict=True):
-            text, weight = f"{count:+d}".replace("-", "−") if count else "0", "bold" if count else "normal"
+    for region, radius_m in enumerate(middle_m):
+        for centre, count in zip(centres, counts[:, region].T, strict=True):
+            weight, colour = ("bold", TEXT) if np.any(count) else ("normal", MUTED)
             style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 9, "fontweight": weight, "zorder": 7}
-            axes.text(
-                radius_m * centre[0], radius_m * centre[1], text, color=TEXT if count else MUTED, bbox=_PLATE, **style
-            )
+            x, y = radius_m * centre
+            axes.text(x, y, _count_text(count), color=colour, bbox=_PLATE, **style)
+
+
+def _count_text(count: NDArray[np.int64]) -> str:
+    if len(count) > 1:
+        return f"{count[0]}|{count[1]}"
+    return f"{count[0]:+d}".replace("-", "−") if count[0] else "0"
 
 
 def _draw_ellipse(axes: Axes, found: GroupEllipse, learner: Vector, group: int) -> None:
@@ -257,15 +274,23 @@ def _arrow(axes: Axes, tip: Vector, colour: str, width: float = 2.5) -> None:
 
 
 class Diagram(NamedTuple):
-    """A diagram: its file's name, what it shows in words, and what draws it."""
+    """A diagram: its file's name, what it shows in words, the method and setup whose world it takes, what draws it."""
 
     file: str
     alt: str
-    draw: Callable[[], Figure]
+    method: MethodName
+    setup: Setup
+    draw: Callable[[WorldConfig], Figure]
 
 
 DIAGRAMS = (
-    Diagram("diagram-3-1.png", "Figure 3.1: what the learning robot perceives in M_sensor", diagram_3_1),
-    Diagram("diagram-4-1.png", "Figures 4.1 and 4.2: the groups as ellipses", diagram_4_1),
-    Diagram("diagram-4-3.png", "Figure 4.3: the velocity of M_OUT as a sum of two", diagram_4_3),
+    Diagram(
+        "diagram-3-1.png",
+        "Figure 3.1: what the learning robot perceives in M_sensor",
+        "sensor",
+        DRAWN_SETUP,
+        diagram_3_1,
+    ),
+    Diagram("diagram-4-1.png", "Figures 4.1 and 4.2: the groups as ellipses", "out", DRAWN_SETUP, diagram_4_1),
+    Diagram("diagram-4-3.png", "Figure 4.3: the velocity of M_OUT as a sum of two", "out", DRAWN_SETUP, diagram_4_3),
 )

@@ -9,9 +9,12 @@ from actors.result_table import LEARNED, ResultRow
 from dashboards.claim_checks import Claim
 from dashboards.claim_text import NOTE, table_of, tally, verdict_table
 from dashboards.diagrams import DIAGRAMS
+from dashboards.example_episodes import EXAMPLES
 from dashboards.pooled import METHOD_NAMES, NUM_CELLS, SETUPS, Results, Setup, success
 from dashboards.result_figures import PICTURES
 
+DRAWINGS = (*EXAMPLES, *DIAGRAMS)
+"""What is drawn from live worlds, beside the pictures of results."""
 BASELINES_NOTE = (
     "`fl-orca` drives the learning robot as the rest of the swarm, with more knowledge than the method's state holds; "
     "`greedy` heads for where the state shows the own group. Means over setups, from the same start scenes."
@@ -53,9 +56,9 @@ def report_markdown(source: str, parts: Sequence[PresetPart]) -> str:
     lines += [NOTE, "", "Every check with its numbers: [claims.md](claims.md).", ""]
     for part in parts:
         lines += _preset_part(part)
-    lines += ["## How it works", ""]
-    for diagram in DIAGRAMS:
-        lines += [f"![{diagram.alt}]({diagram.file})", ""]
+    lines += ["## How it works", "", f"Drawn from worlds of preset {parts[0].name}.", ""]
+    for drawing in DRAWINGS:
+        lines += [f"![{drawing.alt}]({drawing.file})", ""]
     return "\n".join(lines).rstrip("\n") + "\n"
 
 

@@ -27,13 +27,23 @@ def frame_steps(num_states: int, frames: int) -> NDArray[np.int64]:
 
 
 def episode_strip_png(episode: Episode, config: WorldConfig, path: Path, frames: int = 6) -> None:
-    """Writes the strip: the step above each frame, the outcome above the last.
+    """Writes `episode_strip` to a PNG, which is replaced if it exists.
+
+    Raises:
+      ValueError: fewer than 2 frames.
+    """
+    figure = episode_strip(episode, config, frames)
+    figure.savefig(path, format="png", dpi=DPI, pil_kwargs={"optimize": True})
+
+
+def episode_strip(episode: Episode, config: WorldConfig, frames: int = 6, remark: str = "") -> Figure:
+    """The strip: the step above each frame, the outcome above the last.
 
     Args:
       episode: T + 1 recorded states.
       config: the setup it was recorded in.
-      path: the PNG; replaced if it exists.
       frames: how many frames, at least 2; fewer are drawn where there are fewer states.
+      remark: what else stands below.
 
     Raises:
       ValueError: fewer than 2 frames.
@@ -51,8 +61,8 @@ def episode_strip_png(episode: Episode, config: WorldConfig, path: Path, frames:
         figure.figimage(_framed(image), xo=left_px, yo=FOOT_PX)
         text, colour = _heading(int(step), episode, last=place == len(steps) - 1)
         _write(figure, left_px, height_px - HEAD_PX / 2, text, colour, weight="bold")
-    _write(figure, GAP_PX, FOOT_PX / 2, _caption(episode, config), MUTED, weight="normal")
-    figure.savefig(path, format="png", dpi=DPI, pil_kwargs={"optimize": True})
+    _write(figure, GAP_PX, FOOT_PX / 2, f"{_caption(episode, config)} {remark}".rstrip(), MUTED, weight="normal")
+    return figure
 
 
 def _heading(step: int, episode: Episode, last: bool) -> tuple[str, str]:

@@ -12,12 +12,12 @@ from rich.console import Console
 from actors.result_table import read_table
 from dashboards.claim_text import claims_markdown, tally
 from dashboards.claims import judge
-from dashboards.diagrams import DIAGRAMS
 from dashboards.pictures import save_png
 from dashboards.pooled import Results
-from dashboards.report import PresetPart, baselines_of, presets_of, report_markdown
+from dashboards.report import DRAWINGS, PresetPart, baselines_of, presets_of, report_markdown
 from dashboards.result_figures import PICTURES
 from deploy.folders import make_folder, write_text
+from learner.sweep import world_of_label
 from sim_core.checks import require
 
 if TYPE_CHECKING:
@@ -60,7 +60,8 @@ def _write(out: Path, source: str, parts: list[PresetPart]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         for picture in PICTURES:
             save_png(picture.draw(part.results), folder / picture.file)
-    for diagram in DIAGRAMS:
-        save_png(diagram.draw(), out / diagram.file)
+    for drawing in DRAWINGS:
+        world = world_of_label(parts[0].name, drawing.method, *drawing.setup)
+        save_png(drawing.draw(world), out / drawing.file)
     write_text(out / "claims.md", claims_markdown({part.name: part.claims for part in parts}))
     write_text(out / "report.md", report_markdown(source, parts))

@@ -9,12 +9,12 @@ import json
 import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 from actors.result_table import GROUPS, LEARNED, ROBOTS, ResultRow
 from learner.config import WHERE, RunConfig, to_dict
 from learner.presets import PresetName, preset_config
-from sim_core.checks import check_fields, require
+from sim_core.checks import ConfigError, check_fields, require
 from sim_core.config import MethodName, WorldConfig
 
 BaselineName = Literal["fl-orca", "greedy", "random"]
@@ -178,6 +178,16 @@ def make_cell(sweep: SweepConfig, method: MethodName, robots: int, groups: int, 
     scheduled = {"importance_exponent_env_steps": env_steps} if prioritised else {}
     config = dataclasses.replace(config, **{**scheduled, **run})
     return Cell(f"{method}-{robots}r{groups}g-s{seed}-{cell_hash(config)}", config)
+
+
+def world_of_label(label: str, method: MethodName, robots: int, groups: int) -> WorldConfig:
+    """The world in which a sweep of this label plays; that of preset `thesis` where no sweep has such a label."""
+    preset, *changed = label.split("+")
+    try:
+        sweep = SweepConfig(preset=cast(PresetName, preset), set=tuple(changed))
+    except ConfigError:
+        sweep = SweepConfig()
+    return make_cell(sweep, method, robots, groups, 0).config.world
 
 
 def make_cells(sweep: SweepConfig) -> list[Cell]:

@@ -14,8 +14,6 @@ from matplotlib.patches import Circle, Ellipse
 from dashboards.diagrams import (
     DIAGRAMS,
     EPISODE_SEED,
-    OUTSIDE_WORLD,
-    SENSOR_WORLD,
     Diagram,
     best_scene,
     diagram_3_1,
@@ -25,6 +23,7 @@ from dashboards.diagrams import (
     field_strength,
     group_ellipses,
     net_counts,
+    perceived,
     potential_field,
     robots_near,
 )
@@ -32,6 +31,9 @@ from dashboards.pictures import save_png
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
 from sim_core.worlds import WorldBatch
+
+SENSOR_WORLD = WorldConfig(robots=10, groups=3, method="sensor")
+OUTSIDE_WORLD = WorldConfig(robots=10, groups=3, method="out", learner_speed_limit_m_s=1.2)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +88,7 @@ def test_counts_are_those_of_a_count_by_hand(near: WorldBatch):
 def test_counts_stand_in_their_cells(near: WorldBatch):
     counts, q = net_counts(near), SENSOR_WORLD.sectors
     written = {}
-    for text in diagram_3_1().axes[1].texts:
+    for text in diagram_3_1(SENSOR_WORLD).axes[1].texts:
         (x, y), label = text.get_position(), text.get_text().replace("−", "-")
         if text.get_bbox_patch() is not None:
             ring = int(math.hypot(x, y) >= SENSOR_WORLD.inner_radius_m)
@@ -94,17 +96,27 @@ def test_counts_stand_in_their_cells(near: WorldBatch):
     assert written == {(ring, sector): counts[ring, sector] for ring in range(2) for sector in range(q)}
 
 
+def test_counts_apart_stand_side_by_side(near: WorldBatch):
+    world = dataclasses.replace(SENSOR_WORLD, sensor_counts="separate")
+    worlds = best_scene(world, EPISODE_SEED, robots_near)
+    own, others = perceived(worlds)
+    assert (own - others).tolist() == net_counts(near).tolist() == net_counts(worlds).tolist()
+    texts = [text.get_text() for text in diagram_3_1(world).axes[1].texts if text.get_bbox_patch() is not None]
+    wanted = [f"{mine}|{theirs}" for mine, theirs in zip(own.flat, others.flat, strict=True)]
+    assert texts == wanted
+
+
 def test_heading_points_into_the_fullest_sector(near: WorldBatch):
     best = int(np.argmax(net_counts(near).sum(axis=0)))
     middle = -math.pi + (best + 0.5) * 2 * math.pi / SENSOR_WORLD.sectors
-    (tip,) = arrow_tips(diagram_3_1(), axes=1)
+    (tip,) = arrow_tips(diagram_3_1(SENSOR_WORLD), axes=1)
     assert math.atan2(tip[1], tip[0]) == pytest.approx(middle, abs=1e-6)
-    assert f"heading {best}" in diagram_3_1().axes[1].get_title(loc="left")
+    assert f"heading {best}" in diagram_3_1(SENSOR_WORLD).axes[1].get_title(loc="left")
 
 
 def test_robots_are_drawn_where_they_are(near: WorldBatch):
     offsets, _, _ = seen_by_hand(near)
-    drawn = [patch.center for patch in diagram_3_1().axes[0].patches if isinstance(patch, Circle)]
+    drawn = [patch.center for patch in diagram_3_1(SENSOR_WORLD).axes[0].patches if isinstance(patch, Circle)]
     for offset in offsets:
         assert min(math.dist(offset, centre) for centre in drawn) < 1e-6
 
@@ -113,7 +125,11 @@ def test_robots_are_drawn_where_they_are(near: WorldBatch):
 def test_ellipses_are_numpys_confidence_regions(panel: int, covariance: str):
     worlds = best_scene(OUTSIDE_WORLD, EPISODE_SEED, robots_near)
     config = dataclasses.replace(OUTSIDE_WORLD, ellipse_covariance=covariance)  # type: ignore[arg-type]
-    patches = [patch for patch in diagram_4_1().axes[panel].patches if type(patch) is Ellipse and not patch.get_fill()]
+    patches = [
+        patch
+        for patch in diagram_4_1(OUTSIDE_WORLD).axes[panel].patches
+        if type(patch) is Ellipse and not patch.get_fill()
+    ]
     position, learner = worlds.positions()[0].astype(np.float64), int(worlds.state.learner[0])
     assert len(patches) == config.groups
     for group, (found, patch) in enumerate(zip(group_ellipses(worlds, config), patches, strict=True)):
@@ -144,7 +160,7 @@ def test_field_is_minus_the_gradient_of_the_potential(pushed: WorldBatch):
 
 
 def test_arrows_are_a_sum(pushed: WorldBatch):
-    network, field, moved = (np.array(tip) for tip in arrow_tips(diagram_4_3(), axes=0))
+    network, field, moved = (np.array(tip) for tip in arrow_tips(diagram_4_3(OUTSIDE_WORLD), axes=0))
     total = network + field
     limit = pushed.config.learner_speed_limit_m_s
     assert moved == pytest.approx(total * min(1.0, limit / np.hypot(*total)), abs=1e-5)
@@ -160,7 +176,7 @@ def test_arrows_are_a_sum(pushed: WorldBatch):
 @pytest.mark.parametrize("diagram", DIAGRAMS, ids=lambda diagram: diagram.file)
 def test_files_are_small_and_always_the_same(diagram: Diagram, tmp_path: Path):
     for name in ("first.png", "second.png"):
-        save_png(diagram.draw(), tmp_path / name)
+        save_png(diagram.draw(WorldConfig(method=diagram.method, robots=10, groups=3)), tmp_path / name)
     assert (tmp_path / "first.png").read_bytes() == (tmp_path / "second.png").read_bytes()
     assert (tmp_path / "first.png").stat().st_size <= 60 * 1024
 

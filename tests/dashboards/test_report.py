@@ -7,9 +7,8 @@ from collections.abc import Sequence
 
 from actors.result_table import ResultRow
 from dashboards.claims import judge
-from dashboards.diagrams import DIAGRAMS
 from dashboards.pooled import Results, Setup
-from dashboards.report import PresetPart, baselines_of, comparison, presets_of, report_markdown
+from dashboards.report import DRAWINGS, PresetPart, baselines_of, comparison, presets_of, report_markdown
 from dashboards.result_figures import PICTURES
 from tests.dashboards.tables import claimed_table, fixed, row
 
@@ -41,7 +40,7 @@ def test_page_embeds_every_picture_with_words_for_it():
     parts = [part("thesis", claimed_table(), "thesis/"), part("best", claimed_table(), "best/")]
     links = re.findall(r"!\[([^\]]+)\]\(([^)]+)\)", report_markdown("r.csv", parts))
     wanted = [f"{name}/{picture.file}" for name in ("thesis", "best") for picture in PICTURES]
-    assert [link for _, link in links] == wanted + [diagram.file for diagram in DIAGRAMS]
+    assert [link for _, link in links] == wanted + [drawing.file for drawing in DRAWINGS]
     assert len({words for words, _ in links}) == len(links)
 
 

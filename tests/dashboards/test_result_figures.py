@@ -122,6 +122,17 @@ def test_two_methods_captured_is_left_and_lost_is_right(results: Results):
     assert sensor.get_ydata()[0] == pytest.approx(0.136) and out.get_ydata()[0] == pytest.approx(0.064)
 
 
+@pytest.mark.parametrize("lost", [0.4, 6.0, 11.0, 19.0, 43.0, 100.0])
+def test_ticks_of_failures_stand_where_they_say(lost: float):
+    rows = [fixed("sensor", setup, success=0, captured=0, lost=lost) for setup in SETUPS]
+    axes = figure_3_7(Results(rows)).axes[0]
+    axes.figure.canvas.draw()
+    every = zip(axes.get_yticklabels(), axes.get_yticks(), strict=True)
+    ticks = [(label.get_text(), 100 * at) for label, at in every if 0 <= at <= axes.get_ylim()[1]]
+    assert all(text == f"{round(at)}%" and at == pytest.approx(round(at), abs=1e-9) for text, at in ticks)
+    assert 2 <= len(ticks) <= 8
+
+
 def test_a_line_breaks_where_a_cell_is_missing():
     rows = claimed_table(without=[fixed("sensor", Setup(15, 3))])
     line = next(line for line in figure_3_7(Results(rows)).axes[0].lines if len(line.get_xdata()) == 5)

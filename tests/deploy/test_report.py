@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 
 from actors.result_table import ResultRow, write_table
-from dashboards.diagrams import DIAGRAMS
 from dashboards.pooled import Setup
+from dashboards.report import DRAWINGS
 from dashboards.result_figures import PICTURES
 from deploy.report import report
 from deploy.result_options import Report
 from sim_core.checks import ConfigError
 from tests.dashboards.tables import claimed_table, row
 
-COMMON = {"claims.md", "report.md", *(diagram.file for diagram in DIAGRAMS)}
+COMMON = {"claims.md", "report.md", *(drawing.file for drawing in DRAWINGS)}
 
 
 def made(rows: list[ResultRow], folder: Path, name: str = "out") -> dict[str, bytes]:
