@@ -95,8 +95,8 @@ def perceived(worlds: WorldBatch) -> NDArray[np.int64]:
 
 def net_counts(worlds: WorldBatch) -> NDArray[np.int64]:
     """Own less other robots of world 0 `[2, sectors]`, the disc's first."""
-    own, *others = perceived(worlds)
-    return own - others[0] if others else own
+    counts = perceived(worlds)
+    return np.array(counts[0] - counts[1:].sum(axis=0), np.int64)
 
 
 def group_ellipses(worlds: WorldBatch, config: WorldConfig) -> list[GroupEllipse]:

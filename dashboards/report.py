@@ -42,15 +42,18 @@ def baselines_of(rows: Sequence[ResultRow]) -> dict[str, Results]:
     return {name: Results(row._replace(policy=LEARNED) for row in rows if row.policy == name) for name in names}
 
 
-def report_markdown(source: str, parts: Sequence[PresetPart]) -> str:
+def report_markdown(source: str, parts: Sequence[PresetPart], sittings: Sequence[tuple[str, str]] = ()) -> str:
     """The page.
 
     Args:
       source: name of the file with the results.
       parts: one a preset, in the order in which they are printed.
+      sittings: the command and the commit of each start of the sweep, where they are known.
     """
     lines = ["# Results", "", f"Made by `shoal report` from `{source}`.", ""]
     lines += [*_coverage(parts), ""]
+    if sittings:
+        lines += [*table_of(("trained by", "commit"), [(f"`{line}`", commit[:12]) for line, commit in sittings]), ""]
     if len(parts) > 1:
         lines += ["## Presets side by side", "", *comparison({part.name: part.results for part in parts}), ""]
     lines += [NOTE, "", "Every check with its numbers: [claims.md](claims.md).", ""]

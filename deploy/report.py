@@ -17,6 +17,7 @@ from dashboards.pooled import Results
 from dashboards.report import DRAWINGS, PresetPart, baselines_of, presets_of, report_markdown
 from dashboards.result_figures import PICTURES
 from deploy.folders import make_folder, write_text
+from deploy.sittings import read_sittings
 from learner.sweep import world_of_label
 from sim_core.checks import require
 
@@ -40,7 +41,7 @@ def report(command: Report) -> int:
         results = Results(own)
         parts.append(PresetPart(preset, results, judge(results), folder, baselines_of(own)))
     make_folder(command.out, "--out")
-    _write(command.out, command.results.name, parts)
+    _write(command.out, command.results, parts)
     for part in parts:
         Console().print(f"{part.name}: {tally(part.claims)}", highlight=False)
     Console().print(str(command.out / "report.md"), highlight=False, soft_wrap=True)
@@ -53,7 +54,7 @@ def _folder_name(preset: str) -> str:
     return plain if plain == preset else f"{plain}-{zlib.crc32(preset.encode()):08x}"
 
 
-def _write(out: Path, source: str, parts: list[PresetPart]) -> None:
+def _write(out: Path, table: Path, parts: list[PresetPart]) -> None:
     """All files; the page comes last, so that it never embeds what is not there."""
     for part in parts:
         folder = out / part.folder
@@ -64,4 +65,4 @@ def _write(out: Path, source: str, parts: list[PresetPart]) -> None:
         world = world_of_label(parts[0].name, drawing.method, *drawing.setup)
         save_png(drawing.draw(world), out / drawing.file)
     write_text(out / "claims.md", claims_markdown({part.name: part.claims for part in parts}))
-    write_text(out / "report.md", report_markdown(source, parts))
+    write_text(out / "report.md", report_markdown(table.name, parts, read_sittings(table)))

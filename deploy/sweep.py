@@ -15,6 +15,7 @@ from rich.console import Console
 from actors.result_table import LEARNED, ResultRow, read_table, write_table
 from deploy.folders import check_lasting, check_plain_name, make_folder
 from deploy.options import Sweep
+from deploy.sittings import SETTINGS, Sitting, read_sittings, sweep_command
 from deploy.sweep_board import SweepBoard, make_board
 from learner.config import to_dict
 from learner.run_folder import write_json
@@ -34,21 +35,43 @@ class SweepResults:
     Args:
       grid: the sweep.
       folder: its folder, made if missing.
-      known: results of earlier sittings, beside those that the folder's table holds already.
+      known: a table of results of earlier sittings, beside those that the folder's table holds already.
 
     Raises:
-      ConfigError: a setup is not possible, or the folder cannot be written to.
+      ConfigError: a setup is not possible, the folder cannot be written to or holds results of other settings, or a
+        table cannot be read.
     """
 
-    def __init__(self, grid: SweepConfig, folder: Path, known: list[ResultRow]) -> None:
+    def __init__(self, grid: SweepConfig, folder: Path, known: Path | None = None) -> None:
         self._grid = grid
         self.folder = folder
         self.table = folder / RESULTS
         self.cells = make_cells(grid)  # refuses what cannot be, before a folder is made
+        mine = read_table(self.table) if self.table.is_file() else []
+        self._refuse_other_settings(mine)
+        self._known = [*(read_table(known) if known else []), *mine]
+        self._sittings = list(dict.fromkeys([*(read_sittings(known) if known else []), *read_sittings(self.table)]))
         make_folder(folder, "--runs-dir")
-        self._known = [*known, *(read_table(self.table) if self.table.is_file() else [])]
         self._own = {cell.key: self._read(cell.key) for cell in self.cells}
-        self._commit = git_commit()
+
+    def _refuse_other_settings(self, rows: list[ResultRow]) -> None:
+        newest = self._newest()
+        for row in rows:
+            if newest.get(_policy_of(row), row.config) != row.config:
+                raise ConfigError(
+                    f"{self.table} holds results of other settings ({row.method} {row.trained_robots}r×"
+                    f"{row.trained_groups}g, seed {row.seed}): give this sweep a name of its own with --name, or take "
+                    "the table away"
+                )
+
+    def _newest(self) -> dict[tuple[object, ...], str]:
+        """The hash of each cell by what tells a policy from the others."""
+        return {_place(cell, self._grid): cell_hash(cell.config) for cell in self.cells}
+
+    def begin_sitting(self) -> None:
+        """Notes that cells are about to run, for `settings.json`."""
+        sitting = Sitting(sweep_command(self._grid), git_commit())
+        self._sittings = [*(each for each in self._sittings if each != sitting), sitting]
 
     def _read(self, key: str) -> list[ResultRow]:
         table = self.folder / CELLS / key / RESULTS
@@ -57,12 +80,12 @@ class SweepResults:
     def _rows(self) -> list[ResultRow]:
         """All rows: of two of the same evaluation the one of more episodes, none of a cell's former settings."""
         own = [row for rows in self._own.values() for row in rows]
-        newest = {_place(cell, self._grid): cell_hash(cell.config) for cell in self.cells}
+        newest = self._newest()
         best: dict[tuple[object, ...], ResultRow] = {}
         for row in sorted([*self._known, *own], key=lambda row: row.episodes):
-            trained = (row.preset, row.policy, row.method, row.trained_robots, row.trained_groups, row.seed)
-            if newest.get(trained, row.config) == row.config:
-                best[*trained, row.robots, row.groups] = row
+            policy = _policy_of(row)
+            if newest.get(policy, row.config) == row.config:
+                best[*policy, row.robots, row.groups] = row
         return list(best.values())
 
     def finished(self, key: str) -> dict[str, list[ResultRow]]:
@@ -71,7 +94,7 @@ class SweepResults:
         return self.write()
 
     def write(self) -> dict[str, list[ResultRow]]:
-        """Writes `results.csv`, all rows of the sweep's sittings, and `settings.json`, how the last came about.
+        """Writes `results.csv`, all rows of the sweep's sittings, and `settings.json`, how they came about.
 
         Returns:
           The results of every finished cell, by key.
@@ -80,14 +103,23 @@ class SweepResults:
         write_table(self.table, rows)
         trained = [cell.config for cell in self.cells if cell.policy == LEARNED]
         examples = {config.world.method: to_dict(config) for config in reversed(trained)}
-        settings = {"sweep": dataclasses.asdict(self._grid), "commit": self._commit, "a_cell_of_each_method": examples}
-        write_json(self.folder / "settings.json", settings)
+        sittings = [sitting._asdict() for sitting in self._sittings]
+        settings = {
+            "sweep": dataclasses.asdict(self._grid),
+            "sittings": sittings,
+            "a_cell_of_each_method": examples,
+        }
+        write_json(self.folder / SETTINGS, settings)
         return done_cells(self._grid, self.cells, rows)
 
 
 def _place(cell: Cell, grid: SweepConfig) -> tuple[object, ...]:
     world = cell.config.world
     return (grid.label, cell.policy, world.method, world.robots, world.groups, cell.config.seed)
+
+
+def _policy_of(row: ResultRow) -> tuple[object, ...]:
+    return (row.preset, row.policy, row.method, row.trained_robots, row.trained_groups, row.seed)
 
 
 @contextmanager
@@ -140,7 +172,7 @@ def sweep(command: Sweep) -> int:
     check_lasting(launch.runs_dir)
     check_plain_name(name)
     folder = (launch.runs_dir / "sweeps" / name).absolute()
-    results = SweepResults(command.grid, folder, read_table(command.known) if command.known else [])
+    results = SweepResults(command.grid, folder, command.known)
     console = Console(file=sys.stdout)  # by name: Tune's own output is kept from sys.stdout while it runs
     console.print(f"sweep {folder}", highlight=False, soft_wrap=True)
     with _alone_in(folder):
@@ -157,6 +189,7 @@ def _run(command: Sweep, name: str, results: SweepResults, missing: list[Cell], 
     place = SweepPlace(results.folder / CELLS, launch.tracking(), launch.sweep_experiment(name))
     # One process makes store and experiment, before several open them.
     Tracker(place.tracking_uri, place.experiment, launch.artifact_root()).set_views()
+    results.begin_sitting()
     with board:
         listener = _Listener(board, results)
         run_cells(command.grid, missing, place, launch.ray_address(), command.at_once, listener)

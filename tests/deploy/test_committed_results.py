@@ -1,6 +1,7 @@
 """The committed results: `shoal report` makes the committed report of them, and the presets are still theirs."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from PIL import Image
 import dashboards
 from actors.result_table import LEARNED, read_table
 from deploy.cli import main
+from deploy.sittings import read_sittings
 from learner.config import RunConfig, to_dict
 from learner.sweep import SweepConfig, cell_hash, make_cell
 
@@ -25,6 +27,15 @@ def sweep_of(folder):
 
 def test_there_are_results():
     assert FOLDERS
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_the_commands_that_made_the_results_are_known(folder):
+    sittings = read_sittings(folder / "results.csv")
+    assert sittings and all(re.fullmatch("[0-9a-f]{40}", sitting.commit) for sitting in sittings)
+    seeds = {row.seed for row in read_table(folder / "results.csv") if row.policy == LEARNED}
+    told = [re.search(r"--seeds ([\d ]+)", sitting.command) for sitting in sittings]
+    assert seeds == {int(seed) for found in told for seed in (found[1].split() if found else "012")}
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)

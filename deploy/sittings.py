@@ -1,0 +1,40 @@
+"""The sittings of a sweep: with which commands, and with which commit of this code, its results came about."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shlex
+from pathlib import Path
+from typing import NamedTuple
+
+from learner.sweep import SweepConfig
+
+SETTINGS = "settings.json"
+
+
+class Sitting(NamedTuple):
+    """One start of a sweep that had cells to run: its command without where and how many at once, and the commit."""
+
+    command: str
+    commit: str
+
+
+def sweep_command(grid: SweepConfig) -> str:
+    """The command line whose grid this is, with what differs from the defaults."""
+    words = ["shoal", "sweep"]
+    for name, default in dataclasses.asdict(SweepConfig()).items():
+        value = getattr(grid, name)
+        if value != default:
+            words.append(f"--{name.replace('_', '-')}")
+            words += [str(each) for each in value] if isinstance(value, tuple) else [str(value)]
+    return shlex.join(words)
+
+
+def read_sittings(table: Path) -> list[Sitting]:
+    """Those that `settings.json` beside a table of results names; none without such a file."""
+    try:
+        stored = json.loads((table.parent / SETTINGS).read_text())["sittings"]
+        return [Sitting(str(each["command"]), str(each["commit"])) for each in stored]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
