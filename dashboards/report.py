@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from actors.result_table import LEARNED, ResultRow
-from dashboards.claim_checks import Claim
+from dashboards.claim_checks import Claim, Verdict, with_verdict
 from dashboards.claim_text import NOTE, table_of, tally, verdict_table
 from dashboards.diagrams import DIAGRAMS
 from dashboards.example_episodes import EXAMPLES
@@ -42,20 +42,23 @@ def baselines_of(rows: Sequence[ResultRow]) -> dict[str, Results]:
     return {name: Results(row._replace(policy=LEARNED) for row in rows if row.policy == name) for name in names}
 
 
-def report_markdown(source: str, parts: Sequence[PresetPart], sittings: Sequence[tuple[str, str]] = ()) -> str:
+def report_markdown(
+    sources: Sequence[str], parts: Sequence[PresetPart], sittings: Sequence[tuple[str, str]] = ()
+) -> str:
     """The page.
 
     Args:
-      source: name of the file with the results.
+      sources: names of the files with the results.
       parts: one a preset, in the order in which they are printed.
       sittings: the command and the commit of each start of the sweep, where they are known.
     """
-    lines = ["# Results", "", f"Made by `shoal report` from `{source}`.", ""]
+    lines = ["# Results", "", "Made by `shoal report` from " + ", ".join(f"`{name}`" for name in sources) + ".", ""]
     lines += [*_coverage(parts), ""]
     if sittings:
         lines += [*table_of(("trained by", "commit"), [(f"`{line}`", commit[:12]) for line, commit in sittings]), ""]
     if len(parts) > 1:
         lines += ["## Presets side by side", "", *comparison({part.name: part.results for part in parts}), ""]
+        lines += [*verdicts_side_by_side(parts), ""]
     lines += [NOTE, "", "Every check with its numbers: [claims.md](claims.md).", ""]
     for part in parts:
         lines += _preset_part(part)
@@ -63,6 +66,17 @@ def report_markdown(source: str, parts: Sequence[PresetPart], sittings: Sequence
     for drawing in DRAWINGS:
         lines += [f"![{drawing.alt}]({drawing.file})", ""]
     return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def verdicts_side_by_side(parts: Sequence[PresetPart]) -> list[str]:
+    """A row a claim, a column a preset: the verdict, and how many of the claim's checks hold; lines of a table."""
+    header = ("#", "claim", *(part.name for part in parts))
+    rows = []
+    for claims in zip(*(part.claims for part in parts), strict=True):
+        held = (len(with_verdict(claim.checks, Verdict.HOLDS)) for claim in claims)
+        found = (f"{claim.verdict} ({n} of {len(claim.checks)})" for claim, n in zip(claims, held, strict=True))
+        rows.append((str(claims[0].number), claims[0].text, *found))
+    return table_of(header, rows)
 
 
 def _coverage(parts: Sequence[PresetPart]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,14 +27,17 @@ if TYPE_CHECKING:
 
 
 def report(command: Report) -> int:
-    """Writes the report of a table; returns the exit code.
+    """Writes the report of one table or several; returns the exit code.
 
     Raises:
-      ConfigError: the table cannot be read or holds no learned policy, or the folder cannot be written to.
+      ConfigError: a table cannot be read, none holds a learned policy, two count the same one, or the folder cannot be
+        written to.
     """
-    rows = read_table(command.results)
+    tables = command.results
+    rows = [row for table in tables for row in read_table(table)]
     presets = presets_of(rows)
-    require(bool(presets), f"{command.results} holds no results of a learned policy; run a sweep first")
+    sources = ", ".join(map(str, tables))
+    require(bool(presets), f"{sources} holds no results of a learned policy; run a sweep first")
     parts = []
     for preset in presets:
         own = [row for row in rows if row.preset == preset]
@@ -41,7 +45,7 @@ def report(command: Report) -> int:
         results = Results(own)
         parts.append(PresetPart(preset, results, judge(results), folder, baselines_of(own)))
     make_folder(command.out, "--out")
-    _write(command.out, command.results, parts)
+    _write(command.out, tables, parts)
     for part in parts:
         Console().print(f"{part.name}: {tally(part.claims)}", highlight=False)
     Console().print(str(command.out / "report.md"), highlight=False, soft_wrap=True)
@@ -54,7 +58,7 @@ def _folder_name(preset: str) -> str:
     return plain if plain == preset else f"{plain}-{zlib.crc32(preset.encode()):08x}"
 
 
-def _write(out: Path, table: Path, parts: list[PresetPart]) -> None:
+def _write(out: Path, tables: Sequence[Path], parts: list[PresetPart]) -> None:
     """All files; the page comes last, so that it never embeds what is not there."""
     for part in parts:
         folder = out / part.folder
@@ -64,5 +68,6 @@ def _write(out: Path, table: Path, parts: list[PresetPart]) -> None:
     for drawing in DRAWINGS:
         world = world_of_label(parts[0].name, drawing.method, *drawing.setup)
         save_png(drawing.draw(world), out / drawing.file)
+    sittings = list(dict.fromkeys(sitting for table in tables for sitting in read_sittings(table)))
     write_text(out / "claims.md", claims_markdown({part.name: part.claims for part in parts}))
-    write_text(out / "report.md", report_markdown(table.name, parts, read_sittings(table)))
+    write_text(out / "report.md", report_markdown([table.name for table in tables], parts, sittings))

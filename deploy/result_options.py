@@ -20,10 +20,13 @@ Switch = Annotated[UseCounterAction[int], arg(help_behavior_hint="(off by defaul
 class Report:
     """Draw a sweep's figures and judge the dissertation's claims from its table of results."""
 
-    results: Positional[Path]
-    """A results.csv that `shoal sweep` wrote, or one of those in dashboards/results."""
+    results: Positional[tuple[Path, ...]]
+    """A results.csv that `shoal sweep` wrote, or one of those in dashboards/results; several stand side by side."""
     out: Path = Path("runs/report")
     """Folder for report.md, claims.md and the figures."""
+
+    def __post_init__(self) -> None:
+        require(len(self.results) > 0, "name the results.csv of a sweep, as in `shoal report results.csv`")
 
 
 @dataclass(frozen=True, kw_only=True)

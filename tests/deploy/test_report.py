@@ -22,7 +22,7 @@ COMMON = {"claims.md", "report.md", *(drawing.file for drawing in DRAWINGS)}
 def made(rows: list[ResultRow], folder: Path, name: str = "out") -> dict[str, bytes]:
     """The files of a report on `rows`, by their path in its folder."""
     write_table(folder / "results.csv", rows)
-    assert report(Report(results=folder / "results.csv", out=folder / name)) == 0
+    assert report(Report(results=(folder / "results.csv",), out=folder / name)) == 0
     paths = [path for path in (folder / name).rglob("*") if path.is_file()]
     return {path.relative_to(folder / name).as_posix(): path.read_bytes() for path in paths}
 
@@ -73,13 +73,29 @@ def test_the_same_results_give_the_same_bytes(both: dict[str, bytes], tmp_path: 
 def test_refuses_what_cannot_be_reported(rows: list[ResultRow], message: str, tmp_path: Path):
     write_table(tmp_path / "results.csv", rows)
     with pytest.raises(ConfigError, match=re.escape(message)):
-        report(Report(results=tmp_path / "results.csv", out=tmp_path / "out"))
+        report(Report(results=(tmp_path / "results.csv",), out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
 def test_refuses_a_file_that_is_not_there(tmp_path: Path):
     with pytest.raises(ConfigError, match="cannot be read"):
-        report(Report(results=tmp_path / "none.csv", out=tmp_path / "out"))
+        report(Report(results=(tmp_path / "none.csv",), out=tmp_path / "out"))
+
+
+def test_tables_stand_side_by_side(both: dict[str, bytes], tmp_path: Path):
+    tables = tuple(tmp_path / name for name in ("thesis.csv", "best.csv"))
+    for table in tables:
+        write_table(table, [line for line in BOTH if line.preset == table.stem])
+    assert report(Report(results=tables, out=tmp_path / "out")) == 0
+    page = (tmp_path / "out" / "report.md").read_text()
+    assert page.replace("`thesis.csv`, `best.csv`", "`results.csv`") == both["report.md"].decode()
+    assert re.search(r"^\| 14 \| .* \| holds \(10 of 10\) \| no data \(1 of 10\) \|$", page, re.MULTILINE)
+
+
+def test_a_policy_in_two_tables_is_refused(tmp_path: Path):
+    write_table(tmp_path / "results.csv", claimed_table())
+    with pytest.raises(ConfigError, match="twice"):
+        report(Report(results=(tmp_path / "results.csv",) * 2, out=tmp_path / "out"))
 
 
 def test_a_presets_name_leads_nowhere_else(tmp_path: Path):
@@ -96,4 +112,4 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path, out: str):
     write_table(tmp_path / "results.csv", [row("sensor", Setup(5, 1), success=50)])
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="--out"):
-        report(Report(results=tmp_path / "results.csv", out=tmp_path / out))
+        report(Report(results=(tmp_path / "results.csv",), out=tmp_path / out))
