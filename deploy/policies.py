@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from rich.console import Console
 
 from actors.network import WeightsSnapshot
 from actors.vector_env import env_shape
-from learner.checkpoint import best_valid, finished_names, newest_valid
+from learner.checkpoint import Checkpoint, best_valid, finished_names, newest_valid, valid_named
 from learner.config import RunConfig
 from learner.journal import read_rows
 from learner.policy_file import read_policy, read_saved_policy
@@ -16,28 +14,39 @@ from learner.retention import scores_of
 from learner.run_folder import RunFolder
 from sim_core.checks import ConfigError
 
+NEWEST, BEST = "newest", "best"
+"""Which checkpoint is meant, beside the names of single ones."""
 
-def find_policy(folder: RunFolder, config: RunConfig, which: Literal["newest", "best"] = "newest") -> WeightsSnapshot:
+
+def find_policy(folder: RunFolder, config: RunConfig, which: str = NEWEST) -> WeightsSnapshot:
     """The policy of a sweep's finished cell, or that of a usable checkpoint.
 
     Args:
       folder: the run.
       config: its config, or one of another setup that the policy fits.
-      which: the newest checkpoint, or the one that did best in the evaluations during training.
+      which: the newest checkpoint, the one that did best in the evaluations during training, or one by its name.
 
     Raises:
       CheckpointError: there is none, or it does not fit.
     """
     shape = env_shape(config.env)
     is_swept = folder.results.is_file() or not (folder.checkpoints.exists() or folder.storage().checkpoint_url)
-    if folder.policy.is_file() and is_swept:  # of a cell that is done, only the policy is kept
+    if (
+        folder.policy.is_file() and is_swept and which in (NEWEST, BEST)
+    ):  # of a cell that is done, only the policy is kept
         return read_saved_policy(folder.policy, config, shape)
+    return read_policy(_checkpoint(folder, which), config, shape)
+
+
+def _checkpoint(folder: RunFolder, which: str) -> Checkpoint:
     root = folder.checkpoint_location()
-    scores = scores_of(read_rows(folder.journal)) if which == "best" else None
-    checkpoint, skipped = newest_valid(root) if scores is None else best_valid(root, scores)
+    if which not in (NEWEST, BEST):
+        return valid_named(root, which)
+    found = newest_valid(root) if which == NEWEST else best_valid(root, scores_of(read_rows(folder.journal)))
+    checkpoint, skipped = found
     for reason in skipped:
         Console(stderr=True).print(f"skipped: {reason}", markup=False, highlight=False, soft_wrap=True)
-    return read_policy(checkpoint, config, shape)
+    return checkpoint
 
 
 class NewestPolicy:

@@ -47,8 +47,8 @@ class Evaluate:
     """Robots per group; by default those of the training (others: Extrapolation), or 10 for a baseline."""
     groups: int | None = None
     """Groups; by default those of the training (others: Extrapolation), or 2 for a baseline."""
-    checkpoint: Literal["newest", "best"] = "newest"
-    """The newest checkpoint's policy, or the one that did best in the evaluations during training."""
+    checkpoint: str = "newest"
+    """Whose policy: the newest checkpoint's, the best one's by the evaluations during training, or a name (step-…)."""
     out: Path | None = None
     """New file (.zarr) for the results: seed, outcome, length and return of every episode."""
     record: int = 0
@@ -91,8 +91,8 @@ class Watch:
     """Look into a running training: a page on 127.0.0.1 that plays the newest checkpoint's policy, again and again."""
     port: int = 8400
     """--live: port of the page; 0 takes a free one."""
-    checkpoint: Literal["newest", "best"] = "newest"
-    """The newest checkpoint's policy, or the one that did best in the evaluations during training."""
+    checkpoint: str = "newest"
+    """Whose policy: the newest checkpoint's, the best one's by the evaluations during training, or a name (step-…)."""
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
 

@@ -150,6 +150,20 @@ def best_valid(root: Location, scores: list[Scored]) -> tuple[Checkpoint, list[s
     return _first_valid(root, store, best)
 
 
+def valid_named(root: Location, name: str) -> Checkpoint:
+    """The checkpoint of that name, as `finished_names` lists it.
+
+    Raises:
+      UselessCheckpointError: it is damaged or too old.
+      CheckpointError: there is none of that name, it is of a newer format, or the storage does not answer.
+    """
+    store, names = _listed(root)
+    if name not in names:
+        there = ", ".join(names) if names else "none"
+        raise CheckpointError(f"there is no checkpoint {name!r} in {root}; there are: {there}")
+    return read_checkpoint(store, name)
+
+
 def finished_names(root: Location) -> list[str]:
     """Names of the finished checkpoints, newest first; whether they are whole, a reader finds out.
 

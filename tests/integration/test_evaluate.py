@@ -115,6 +115,7 @@ def test_a_baselines_name_is_taken_and_a_run_of_that_name_is_named_as_a_folder(c
     ("arguments", "words"),
     [
         (["r", "--preset", "best"], ["--preset", "'r' has a preset of its own"]),
+        (["r", "--checkpoint", "step-7"], ["no checkpoint 'step-7'", "there are: none"]),
         (["r", "--method", "in"], ["--method", "fl-orca, greedy, random", "'r' has a method of its own"]),
         (["greedy", "--method", "touch"], ["--method", "touch"]),
         (["greedy", "--robots", "1"], ["robots", "at least 2"]),

@@ -17,6 +17,7 @@ from learner.checkpoint import (
     keep_checkpoints,
     newest_valid,
     read_checkpoint,
+    valid_named,
 )
 from learner.checkpoint_store import open_store
 from learner.manifest import CheckpointError, UselessCheckpointError, encode_manifest
@@ -250,6 +251,9 @@ def test_the_best_are_kept_too_and_found_again(tmp_path):
     assert found.folder == folders[40] and "step-000000000020" in skipped[0]
     with pytest.raises(CheckpointError, match="as old as an evaluation"):
         best_valid(tmp_path, [])
+    assert valid_named(tmp_path, folders[40].name).folder == folders[40]
+    with pytest.raises(CheckpointError, match=f"no checkpoint 'step-7'.*there are: .*{folders[40].name}"):
+        valid_named(tmp_path, "step-7")
 
 
 def test_what_was_skipped_on_resume_goes_and_does_not_push_out_what_is_good(tmp_path):
