@@ -106,6 +106,15 @@ def group_ellipses(worlds: WorldBatch, config: WorldConfig) -> list[GroupEllipse
     return [group_ellipse(group, state.pos_x[0], state.pos_y[0], left_out, params) for group in range(config.groups)]
 
 
+def sector_frame(worlds: WorldBatch) -> Vector:
+    """The rotation `[2, 2]` from the frame of the sectors of world 0 to the world's."""
+    if worlds.config.sector_frame == "world":
+        return np.eye(2)
+    own = int(worlds.state.learner[0]) // worlds.config.robots
+    x, y = np.array([worlds.state.goal_x[0, own], worlds.state.goal_y[0, own]], np.float64) - _learner_position(worlds)
+    return np.array([[x, -y], [y, x]]) / math.hypot(x, y)
+
+
 def executed_velocity(worlds: WorldBatch, action: int) -> Vector:
     """The velocity `[2]` with which the learning robot of world 0 moves when the network says `action`, m/s."""
     out_x, out_y = np.zeros(worlds.num_worlds, np.float32), np.zeros(worlds.num_worlds, np.float32)
@@ -121,11 +130,12 @@ def diagram_3_1(world: WorldConfig) -> Figure:
     left, right = figure.subplots(1, 2)
     config = worlds.config
     _draw_robots(left, worlds, reach_m=config.outer_radius_m + 0.25)
-    _draw_regions(left, config, filled=True)
+    _draw_regions(left, config)
     left.set_title("(a) disc R1 and ring R1 … R2; black: the learning robot", **_TITLE)
     _draw_robots(right, worlds, reach_m=config.outer_radius_m + 0.25, opacity=0.25)
-    _draw_regions(right, config, filled=False)
-    _draw_counts(right, config, counts)
+    frame = sector_frame(worlds)
+    _draw_regions(right, config, frame)
+    _draw_counts(right, config, counts, frame)
     action = int(np.argmax(net_counts(worlds).sum(axis=0)))
     _arrow(right, executed_velocity(worlds, action) * 0.9 * config.outer_radius_m, HEADING)
     state = "own less other" if len(counts) == 1 else "own | other"
@@ -209,10 +219,10 @@ def _draw_robots(axes: Axes, worlds: WorldBatch, reach_m: float, opacity: float 
     axes.spines[:].set_color(GRID)
 
 
-def _draw_regions(axes: Axes, config: WorldConfig, filled: bool) -> None:
-    """Disc R1 and ring R1 … R2 with their radii, or both cut into sectors."""
+def _draw_regions(axes: Axes, config: WorldConfig, frame: Vector | None = None) -> None:
+    """Disc R1 and ring R1 … R2 with their radii, or both cut into sectors of a frame."""
     inner, outer = config.inner_radius_m, config.outer_radius_m
-    if filled:
+    if frame is None:
         axes.add_patch(Wedge((0, 0), outer, 0, 360, width=outer - inner, fc=RING, ec="none", zorder=0))
         axes.add_patch(Circle((0, 0), inner, fc=DISC, ec="none", zorder=0))
         for radius, name, down in ((inner, "R1", -0.75), (outer, "R2", -1.15)):
@@ -221,16 +231,16 @@ def _draw_regions(axes: Axes, config: WorldConfig, filled: bool) -> None:
             label = f"{name} = {radius:g} m"
             axes.text(0.75 * tip[0], 0.75 * tip[1], label, bbox=_PLATE, ha="center", fontsize=8, color=TEXT, zorder=6)
     else:
-        for edge in sector_edges(config.sectors):
+        for edge in sector_edges(config.sectors) @ frame.T:
             axes.plot(*zip((0, 0), outer * edge, strict=True), color=MUTED, lw=0.8, zorder=0)
     for radius in (inner, outer):
         axes.add_patch(Circle((0, 0), radius, fill=False, ec=MUTED, lw=1.0, zorder=0))
 
 
-def _draw_counts(axes: Axes, config: WorldConfig, counts: NDArray[np.int64]) -> None:
+def _draw_counts(axes: Axes, config: WorldConfig, counts: NDArray[np.int64], frame: Vector) -> None:
     """Each cell's count in its middle, or both with a bar between; `[kinds, 2, sectors]`."""
     middle_m = (0.62 * config.inner_radius_m, 0.5 * (config.inner_radius_m + config.outer_radius_m))
-    centres = heading_velocities(config, np.float64)[: config.sectors] / config.learner_speed_m_s
+    centres = heading_velocities(config, np.float64)[: config.sectors] @ frame.T / config.learner_speed_m_s
     for region, radius_m in enumerate(middle_m):
         for centre, count in zip(centres, counts[:, region].T, strict=True):
             weight, colour = ("bold", TEXT) if np.any(count) else ("normal", MUTED)

@@ -119,6 +119,7 @@ def _scene(config: WorldConfig) -> dict[str, Any]:
         "robots_per_group": config.robots,
         "groups": config.groups,
         "sectors": config.sectors,
+        "sectors_face_goal": config.sector_frame == "goal",
         "time_step_s": config.time_step_s,
         "view_half_m": view_half_m(config),
         "arena_radius_m": config.arena_radius_m,

@@ -95,6 +95,11 @@ def export(command: Export) -> int:
     check_packages()
     folder, config, weights = find_source(command.run, command.runs_dir)
     require(
+        command.bare or config.world.sector_frame == "world",
+        "a robot's export takes positions in the world's frame, but this policy was trained with sector_frame = goal; "
+        "export observation to action values with --bare True",
+    )
+    require(
         config.env.is_swarm or command.bare,
         f"what a robot senses in {config.env_id} is not known; export observation to action values with --bare True",
     )

@@ -40,6 +40,8 @@ class WorldConfig:
 
     sectors: int = 8
     """q, the number of sectors per sensing region and of headings (not given in the text)."""
+    sector_frame: Literal["world", "goal"] = "world"
+    """`sensor`: angle 0 of sectors and headings is the world's +x axis (Eq. 3.3), or points to the own goal (ours)."""
     stop_action: bool = False
     """Adds an action that keeps the learning robot where it is (ours; the text has headings only)."""
     inner_radius_m: float = 0.5
@@ -196,6 +198,10 @@ def _check_counts(config: WorldConfig) -> None:
         config.method == "sensor" or config.ellipse_counts_learner or config.robots >= 3,
         f"robots must be at least 3 per group for method {config.method!r}, not {config.robots}: an ellipse without "
         "the learning robot (ellipse_counts_learner) needs two others",
+    )
+    require(
+        config.method == "sensor" or config.sector_frame == "world",
+        f"sector_frame must be 'world' for method {config.method!r}, whose state is in the world's frame",
     )
     require(1 <= config.max_neighbours <= 64, f"max_neighbours must be between 1 and 64, not {config.max_neighbours}")
 

@@ -97,12 +97,21 @@ function drawSensing() {
   if (action >= 0 && action < data.sectors) drawHeading(x, y, inner, headingOf(action));
 }
 
-function headingOf(action) { return Math.PI / data.sectors + action * 2 * Math.PI / data.sectors - Math.PI; }
+// The angle that sectors count from: the world's, or that of the learning robot's goal.
+function frameTurn() {
+  if (!data.sectors_face_goal) return 0;
+  const [goalX, goalY] = data.goals[learnerGroup];
+  return Math.atan2(goalY - positionOf(data.learner, 1), goalX - positionOf(data.learner, 0));
+}
+
+function headingOf(action) {
+  return Math.PI / data.sectors + action * 2 * Math.PI / data.sectors - Math.PI + frameTurn();
+}
 
 function drawSectors(x, y, radius) {
   context.beginPath();
   for (let sector = 0; sector < data.sectors; sector++) {
-    const turn = sector * 2 * Math.PI / data.sectors - Math.PI;
+    const turn = sector * 2 * Math.PI / data.sectors - Math.PI + frameTurn();
     context.moveTo(x, y);
     context.lineTo(x + radius * Math.cos(turn), y - radius * Math.sin(turn));
   }

@@ -2,8 +2,9 @@
 
 Two sensing regions, the disc of radius R1 and the ring from R1 to R2, are cut into q sectors
 (Figure 3.1). The state is, per region and sector, the number of own-group robots less the number of
-other-group robots (3.2.1). Sectors and headings are in the world frame. `sensor_counts = separate`, of
-ours, puts the two counts apart.
+other-group robots (3.2.1). Sectors and headings are in the world frame. Of ours are `sensor_counts =
+separate`, which puts the two counts apart, and `sector_frame = goal`, which turns sectors and headings so
+that angle 0 is the direction of the own goal.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ class SensorParams(NamedTuple):
     robots: int
     sectors: int
     separate: bool
+    faces_goal: bool
     inner_sq: Any
     outer_sq: Any
     outer_m: Any
@@ -65,6 +67,27 @@ def sector_of(dx, dy, edges):
 
 
 @kernel
+def _goal_direction(state, world, robots):
+    """Unit vector from the learning robot to its goal; +x where it stands on it."""
+    learner = state.learner[world]
+    group = learner // robots
+    dx = state.goal_x[world, group] - state.pos_x[world, learner]
+    dy = state.goal_y[world, group] - state.pos_y[world, learner]
+    length = np.sqrt(dx * dx + dy * dy)
+    if length == 0.0:
+        return np.cos(dx), dy  # (1, 0) of the positions' dtype
+    return dx / length, dy / length
+
+
+@kernel
+def _turn_to_goal(state, out_x, out_y, robots):
+    for world in range(out_x.shape[0]):
+        cos, sin = _goal_direction(state, world, robots)
+        x, y = out_x[world], out_y[world]
+        out_x[world], out_y[world] = cos * x - sin * y, sin * x + cos * y
+
+
+@kernel
 def _perceive(state, mask, out, edges, params):
     p = params[0]
     for world in range(mask.shape[0]):
@@ -74,12 +97,15 @@ def _perceive(state, mask, out, edges, params):
         learner = state.learner[world]
         group_begin = learner // p.robots * p.robots
         group_end = group_begin + p.robots
+        cos, sin = _goal_direction(state, world, p.robots)
         out[world, :] = 0
         for other in range(pos_x.shape[0]):
             dx, dy = pos_x[other] - pos_x[learner], pos_y[other] - pos_y[learner]
             dist_sq = dx * dx + dy * dy
             if other == learner or dist_sq >= p.outer_sq:
                 continue
+            if p.faces_goal:
+                dx, dy = cos * dx + sin * dy, cos * dy - sin * dx
             cell = sector_of(dx, dy, edges) + (0 if dist_sq < p.inner_sq else p.sectors)
             step = 1
             if not group_begin <= other < group_end:
@@ -131,6 +157,7 @@ class SensorMethod(Method):
         """Takes its constants from `config`."""
         separate = config.sensor_counts == "separate"
         self.observation_shape = ((4 if separate else 2) * config.sectors,)
+        self._robots, self._faces_goal = config.robots, config.sector_frame == "goal"
         self._velocities = heading_velocities(config, np.float32)
         self._edges = sector_edges(config.sectors)
         real = np.float32
@@ -139,6 +166,7 @@ class SensorMethod(Method):
                 robots=config.robots,
                 sectors=config.sectors,
                 separate=separate,
+                faces_goal=config.sector_frame == "goal",
                 inner_sq=real(config.inner_radius_m) ** 2,
                 outer_sq=real(config.outer_radius_m) ** 2,
                 outer_m=real(config.outer_radius_m),
@@ -152,12 +180,14 @@ class SensorMethod(Method):
         )
 
     def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
-        """Eq. 3.4: constant speed towards the chosen sector's centre.
+        """Eq. 3.4: constant speed towards the chosen sector's centre, in the frame of the sectors.
 
         Raises:
           ValueError: there is not one action a world, or one is none of the actions.
         """
         write_headings(self._velocities, action, out_x, out_y)
+        if self._faces_goal:
+            _turn_to_goal(state, out_x, out_y, self._robots)
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
         """3.2.1: `[num_worlds, 2q]` counts, the inner disc's q first; apart, 2q of the own group, then 2q of others."""

@@ -114,6 +114,22 @@ def test_heading_points_into_the_fullest_sector(near: WorldBatch):
     assert f"heading {best}" in diagram_3_1(SENSOR_WORLD).axes[1].get_title(loc="left")
 
 
+def test_sectors_that_face_the_goal_are_drawn_so():
+    world = dataclasses.replace(SENSOR_WORLD, sector_frame="goal")
+    worlds = best_scene(world, EPISODE_SEED, robots_near)
+    state, learner = worlds.state, int(worlds.state.learner[0])
+    own = learner // world.robots
+    towards = (state.goal_y[0, own] - state.pos_y[0, learner], state.goal_x[0, own] - state.pos_x[0, learner])
+    best = int(np.argmax(net_counts(worlds).sum(axis=0)))
+    middle = -math.pi + (best + 0.5) * 2 * math.pi / world.sectors + math.atan2(*towards)
+    axes = diagram_3_1(world).axes[1]
+    (tip,) = (text.xy for text in axes.texts if getattr(text, "arrow_patch", None) is not None)  # type: ignore[attr-defined]
+    assert math.cos(math.atan2(tip[1], tip[0]) - middle) == pytest.approx(1.0, abs=1e-6)
+    plates = [text for text in axes.texts if text.get_bbox_patch() is not None]
+    fullest = plates[best + world.sectors].get_position()
+    assert math.cos(math.atan2(fullest[1], fullest[0]) - middle) == pytest.approx(1.0, abs=1e-6)
+
+
 def test_robots_are_drawn_where_they_are(near: WorldBatch):
     offsets, _, _ = seen_by_hand(near)
     drawn = [patch.center for patch in diagram_3_1(SENSOR_WORLD).axes[0].patches if isinstance(patch, Circle)]

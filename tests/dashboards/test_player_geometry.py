@@ -67,6 +67,17 @@ def test_the_heading_drawn_is_the_one_driven(page: Any, episode: Episode):
     assert page.execute_script("return actions[5]") == episode.action[5]
 
 
+def test_sectors_that_face_the_goal_are_drawn_so(page: Any, episode: Episode):
+    step = STEPS[1]
+    page.execute_script("data.sectors_face_goal = true; seek(arguments[0])", step)
+    towards = episode.goal[episode.learner // OUT.robots] - episode.position[step, episode.learner]
+    for action, heading in enumerate(heading_velocities(OUT, np.float64)[: OUT.sectors]):
+        turn = page.execute_script("return headingOf(arguments[0])", action)
+        expected = np.arctan2(*heading[::-1]) + np.arctan2(*towards[::-1])
+        np.testing.assert_allclose([np.cos(turn), np.sin(turn)], [np.cos(expected), np.sin(expected)], atol=0.01)
+    page.execute_script("data.sectors_face_goal = false")
+
+
 def test_orca_lines_are_rvo2s(page: Any, episode: Episode):
     known = np.delete(np.arange(OUT.num_robots), episode.learner)  # M_OUT: nobody sees the learning robot
     compared = 0

@@ -91,16 +91,19 @@ def test_the_example_refuses_an_export_that_answers_otherwise(exported, tmp_path
     assert "does not answer as it should" in done.stderr
 
 
-def test_another_environment_is_exported_bare(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("env", "size"), [(["--env-id", "CartPole-v1"], 4), (["--robots", "3", "--sector-frame", "goal"], 16)]
+)
+def test_what_a_robot_cannot_sense_by_itself_is_exported_bare(env, size, tmp_path, capsys):
     small = ["--total-env-steps", "3000", "--min-replay", "500", "--final-eval-episodes", "4", "--eval-episodes", "2"]
     runs = ["--runs-dir", str(tmp_path / "runs")]
-    assert main(["train", *runs, "--name", "c", "--env-id", "CartPole-v1", "--engine", "process", *small]) == 0
+    assert main(["train", *runs, "--name", "c", *env, "--engine", "process", *small]) == 0
     assert export("c", *runs) == 2
     assert "--bare True" in capsys.readouterr().err
     assert export("c", *runs, "--bare", "True") == 0
     about = json.loads((tmp_path / "runs/c/artifacts/export-bare/policy.json").read_text())
     assert [port["name"] for port in about["inputs"]] == ["observation"]
-    assert about["inputs"][0]["shape"] == ["batch", 4]
+    assert about["inputs"][0]["shape"] == ["batch", size]
     assert "method" not in about
 
 

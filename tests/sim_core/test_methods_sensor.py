@@ -6,6 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
+from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 from sim_core.methods import METHODS, make_method
 from sim_core.methods.sensor import COUNT_LIMIT, heading_velocities, sector_edges, sector_of
@@ -65,6 +66,50 @@ def test_counts_apart_are_what_the_difference_is_of(sectors, make_state):
         dist_sq = ((np.delete(pos, learner, axis=0) - pos[learner]) ** 2).sum(axis=1)
         mates = np.delete(np.arange(30), learner) // 10 == learner // 10
         assert (own.sum(), others.sum()) == tuple((dist_sq[part] < 1.5**2).sum() for part in (mates, ~mates))
+
+
+def turned(angle):
+    """The rotation by `angle` [2, 2]."""
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+@pytest.mark.parametrize("sensor_counts", ["difference", "separate"])
+def test_sectors_towards_the_goal_are_those_of_a_world_turned_until_the_goal_lies_at_angle_0(sensor_counts, make_state):
+    world = WorldConfig(robots=10, groups=3, sectors=6, sensor_counts=sensor_counts)
+    facing, rng, compared = dataclasses.replace(world, sector_frame="goal"), np.random.default_rng(6), 0
+    for _ in range(60):
+        pos, learner = rng.uniform(-1.6, 1.6, (30, 2)).astype(REAL), int(rng.integers(30))
+        goals = rng.uniform(-5, 5, (3, 2)).astype(REAL)
+        towards = goals[learner // 10] - pos[learner]
+        rotation = turned(-np.arctan2(towards[1], towards[0]))
+        aligned = (pos - pos[learner]) @ rotation.T
+        if brute_force(world, aligned, learner)[1]:
+            compared += 1
+            seen = observe(facing, make_state(facing, pos, goals, learner=learner))
+            assert seen.tolist() == observe(world, make_state(world, aligned, goals, learner=learner)).tolist()
+    assert compared > 30
+
+
+def test_headings_towards_the_goal(make_state):
+    config = WorldConfig(robots=2, groups=2, sectors=4, sector_frame="goal", stop_action=True)
+    pos, goals = [(0, 0), (1, 0), (5, 5), (4, 5)], [(9, 9), (5, 2)]
+    for learner, angle in ((0, np.pi / 4), (2, -np.pi / 2)):
+        method, out_x, out_y = make_method(config), np.zeros(1, REAL), np.zeros(1, REAL)
+        for action, heading in enumerate(heading_velocities(config, np.float64)):
+            method.velocity(make_state(config, pos, goals, learner=learner), np.array([action]), out_x, out_y)
+            np.testing.assert_allclose([out_x[0], out_y[0]], turned(angle) @ heading, atol=1e-6)
+
+
+def test_on_its_goal_a_robot_faces_the_x_axis(make_state):
+    config = WorldConfig(robots=2, groups=1, sectors=4, sector_frame="goal")
+    state = make_state(config, [(3, 3), (4, 3.5)], [(3, 3)])
+    assert observe(config, state).tolist() == observe(WorldConfig(robots=2, groups=1, sectors=4), state).tolist()
+
+
+@pytest.mark.parametrize("method", ["in", "out"])
+def test_only_m_sensor_turns_its_sectors(method):
+    with pytest.raises(ConfigError, match="sector_frame must be 'world'"):
+        WorldConfig(method=method, sector_frame="goal")
 
 
 def test_perception_by_hand(make_state):
