@@ -294,13 +294,7 @@ class Diagram(NamedTuple):
 
 
 DIAGRAMS = (
-    Diagram(
-        "diagram-3-1.png",
-        "Figure 3.1: what the learning robot perceives in M_sensor",
-        "sensor",
-        DRAWN_SETUP,
-        diagram_3_1,
-    ),
+    Diagram("diagram-3-1.png", "Figure 3.1: what M_sensor's robot perceives", "sensor", DRAWN_SETUP, diagram_3_1),
     Diagram("diagram-4-1.png", "Figures 4.1 and 4.2: the groups as ellipses", "out", DRAWN_SETUP, diagram_4_1),
     Diagram("diagram-4-3.png", "Figure 4.3: the velocity of M_OUT as a sum of two", "out", DRAWN_SETUP, diagram_4_3),
 )

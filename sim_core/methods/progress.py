@@ -1,4 +1,4 @@
-"""Progress of the learning robot itself towards its goal, which step rewards speak of."""
+"""The learning robot and its goal: where it lies, and whether a step came closer, which step rewards speak of."""
 
 from __future__ import annotations
 
@@ -8,12 +8,19 @@ from sim_core.jit import kernel
 
 
 @kernel
-def came_closer(state, world, robots):
-    """Whether the step brought a world's learning robot closer to its group's goal; remembers the new distance."""
+def goal_offset(state, world, robots):
+    """(dx, dy) in metres from a world's learning robot to its group's goal."""
     learner = state.learner[world]
     group = learner // robots
-    dx = state.pos_x[world, learner] - state.goal_x[world, group]
-    dy = state.pos_y[world, learner] - state.goal_y[world, group]
+    dx = state.goal_x[world, group] - state.pos_x[world, learner]
+    dy = state.goal_y[world, group] - state.pos_y[world, learner]
+    return dx, dy
+
+
+@kernel
+def came_closer(state, world, robots):
+    """Whether the step brought a world's learning robot closer to its group's goal; remembers the new distance."""
+    dx, dy = goal_offset(state, world, robots)
     distance_m = np.sqrt(dx * dx + dy * dy)
     closer = distance_m < state.goal_distance_m[world]
     state.goal_distance_m[world] = distance_m

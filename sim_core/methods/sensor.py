@@ -19,7 +19,7 @@ from sim_core.config import WorldConfig
 from sim_core.jit import kernel
 from sim_core.methods.base import Method
 from sim_core.methods.headings import heading_velocities, write_headings
-from sim_core.methods.progress import came_closer
+from sim_core.methods.progress import came_closer, goal_offset
 from sim_core.outcomes import Outcome, end_of_step
 from sim_core.packed import packed
 from sim_core.state import WorldState
@@ -69,10 +69,7 @@ def sector_of(dx, dy, edges):
 @kernel
 def _goal_direction(state, world, robots):
     """Unit vector from the learning robot to its goal; +x where it stands on it."""
-    learner = state.learner[world]
-    group = learner // robots
-    dx = state.goal_x[world, group] - state.pos_x[world, learner]
-    dy = state.goal_y[world, group] - state.pos_y[world, learner]
+    dx, dy = goal_offset(state, world, robots)
     length = np.sqrt(dx * dx + dy * dy)
     if length == 0.0:
         return np.cos(dx), dy  # (1, 0) of the positions' dtype
