@@ -15,11 +15,12 @@ DETAILS = ("check", "wanted", "measured (95 % interval)", "seeds", "episodes", "
 NOTE = """\
 Rates with 95 % intervals: Wilson's on counts pooled over training seeds, Newcombe's and Donner and Zou's for
 differences and means. Counts of different seeds vary more than those of one policy: the intervals are widened by
-how much more, estimated over the cells of one method and as many robots (Pearson's dispersion). With one seed they
-speak of that policy alone. A check **holds** where its whole interval is in the wanted range, **does not hold**
-where none of it is, and is **undecided** between; `≈` and "around" are met by the value alone (within 10 points,
-for failure rates within 2). "Flat", "similar" and "at least as good" allow 2 points. A claim holds if all its
-checks hold, and does not if any does not."""
+how much more, estimated over the cells of one method and as many robots (Pearson's dispersion, whose variances are
+proportional to p(1 − p)). With one seed they speak of that policy alone. All play the same start scenes. A check
+**holds** where its whole interval is in the wanted range, **does not hold** where none of it is, and is
+**undecided** between; `≈` and "around" are met by the value alone (within 10 points, for failure rates within 2).
+"Flat", "similar" and "at least as good" allow 2 points. A claim holds if all its checks hold, and does not if any
+does not."""
 
 
 def table_of(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

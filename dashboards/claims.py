@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
-from actors.estimates import dispersion, rate
+from actors.estimates import ratio
 from actors.result_table import GROUPS, ROBOTS
 from dashboards.claim_checks import (
     ABOUT_FAILURE,
@@ -173,11 +173,8 @@ def _collisions_among_failures(results: Results) -> Measured | None:
     failed = sum(cell.episodes - cell.count(Outcome.GOAL) for cell in cells)
     if len(cells) < len(SETUPS) or failed == 0:
         return None
-    collided = sum(cell.count(Outcome.COLLISION) for cell in cells)
-    seeds = [
-        [(row.collision, row.episodes - row.goal) for row in cell.rows if row.goal < row.episodes] for cell in cells
-    ]
-    return Measured(rate(collided, failed, dispersion(seeds)), failed, max(len(cell.rows) for cell in cells))
+    seeds = [[(row.collision, row.episodes - row.goal) for row in cell.rows] for cell in cells]
+    return Measured(ratio(seeds), failed, max(len(cell.rows) for cell in cells))
 
 
 def _out_decays(results: Results) -> list[Check]:

@@ -30,7 +30,7 @@ AT_ONCE = 250
 FRAMES = 5
 
 
-@functools.lru_cache(maxsize=32)  # a report of several presets draws the same
+@functools.lru_cache(maxsize=32)  # reports of the same preset in one process draw the same
 def first_episode(world: WorldConfig, rule: Baseline, outcome: Outcome) -> Episode | None:
     """The first of `SEARCHED` episodes of the rule that ends so, None if none does."""
     spec = EnvSpec(ENV_ID, world)

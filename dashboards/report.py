@@ -62,7 +62,8 @@ def report_markdown(
     lines += [NOTE, "", "Every check with its numbers: [claims.md](claims.md).", ""]
     for part in parts:
         lines += _preset_part(part)
-    lines += ["## How it works", "", f"Drawn from worlds of preset {parts[0].name}.", ""]
+    where = f"Drawn from worlds of preset {parts[0].name}, where its settings fit the drawn method and setup."
+    lines += ["## How it works", "", where, ""]
     for drawing in DRAWINGS:
         lines += [f"![{drawing.alt}]({drawing.file})", ""]
     return "\n".join(lines).rstrip("\n") + "\n"

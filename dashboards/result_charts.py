@@ -29,7 +29,7 @@ from sim_core.outcomes import OUTCOME_NAMES, Outcome
 NAMED = {name: Outcome(number) for number, name in enumerate(OUTCOME_NAMES)}
 FAVOURITE = Setup(10, 2)
 """The setup that charts show first, where it has data."""
-INTERVALS = "Brackets are 95 % intervals (Wilson)."
+INTERVALS = "Brackets are 95 % intervals (Wilson's, widened by what seeds differ)."
 HEAT = "Cividis"
 """Colour scale of shares; the same to people who do not tell red from green."""
 

@@ -24,8 +24,8 @@ from learner.run_folder import RunFolder
 from sim_core.checks import require
 
 POLL_S = 0.1
-LOOKS = 2.0
-"""Times `every_s`: so long a victim of the kind that was drawn is looked for, before another kind is drawn."""
+LOOK_S = 20.0
+"""How long to look for a victim of the kind that was drawn, such as an evaluation, before another is drawn."""
 FULL_S = 8.0
 """A process finds its disk full for so long, in which a checkpoint is likely to come."""
 DELAY_S = 2.0
@@ -137,7 +137,7 @@ class _ChaosRun:
         """The kind that was drawn last and is still looked for, or another."""
         if self._drawn is None or time.monotonic() > self._drawn[1]:
             kind = self._rng.choices(KINDS, [kind.weight for kind in KINDS])[0]
-            self._drawn = (kind, time.monotonic() + LOOKS * self._command.every_s)
+            self._drawn = (kind, time.monotonic() + LOOK_S)
         return self._drawn[0]
 
     def _hurt(self) -> bool:

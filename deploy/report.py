@@ -34,7 +34,7 @@ def report(command: Report) -> int:
         written to.
     """
     tables = command.results
-    rows = [row for table in tables for row in read_table(table)]
+    rows = list(dict.fromkeys(row for table in tables for row in read_table(table)))  # sweeps share their baselines
     presets = presets_of(rows)
     sources = ", ".join(map(str, tables))
     require(bool(presets), f"{sources} holds no results of a learned policy; run a sweep first")
@@ -50,6 +50,11 @@ def report(command: Report) -> int:
         Console().print(f"{part.name}: {tally(part.claims)}", highlight=False)
     Console().print(str(command.out / "report.md"), highlight=False, soft_wrap=True)
     return 0
+
+
+def _names(tables: Sequence[Path]) -> list[str]:
+    """The tables' names, with their folders' where there are several."""
+    return [table.name if len(tables) == 1 else f"{table.absolute().parent.name}/{table.name}" for table in tables]
 
 
 def _folder_name(preset: str) -> str:
@@ -70,4 +75,4 @@ def _write(out: Path, tables: Sequence[Path], parts: list[PresetPart]) -> None:
         save_png(drawing.draw(world), out / drawing.file)
     sittings = list(dict.fromkeys(sitting for table in tables for sitting in read_sittings(table)))
     write_text(out / "claims.md", claims_markdown({part.name: part.claims for part in parts}))
-    write_text(out / "report.md", report_markdown([table.name for table in tables], parts, sittings))
+    write_text(out / "report.md", report_markdown(_names(tables), parts, sittings))

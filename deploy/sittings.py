@@ -6,7 +6,7 @@ import dataclasses
 import json
 import shlex
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from learner.sweep import SweepConfig
 
@@ -32,9 +32,19 @@ def sweep_command(grid: SweepConfig) -> str:
 
 
 def read_sittings(table: Path) -> list[Sitting]:
-    """Those that `settings.json` beside a table of results names; none without such a file."""
+    """Those that `settings.json` beside a table of results names; none without such a file.
+
+    Before there were sittings, the file told of the last one alone, as `sweep` and `commit`.
+    """
     try:
-        stored = json.loads((table.parent / SETTINGS).read_text())["sittings"]
-        return [Sitting(str(each["command"]), str(each["commit"])) for each in stored]
+        stored = json.loads((table.parent / SETTINGS).read_text())
+        if "sittings" not in stored:
+            return [Sitting(sweep_command(_grid_of(stored["sweep"])), str(stored["commit"]))]
+        return [Sitting(str(each["command"]), str(each["commit"])) for each in stored["sittings"]]
     except (OSError, ValueError, KeyError, TypeError):
         return []
+
+
+def _grid_of(values: dict[str, Any]) -> SweepConfig:
+    plain: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    return SweepConfig(**plain)

@@ -19,7 +19,7 @@ from deploy.sittings import SETTINGS, Sitting, read_sittings, sweep_command
 from deploy.sweep_board import SweepBoard, make_board
 from learner.config import to_dict
 from learner.run_folder import write_json
-from learner.sweep import Cell, SweepConfig, cell_hash, done_cells, make_cells
+from learner.sweep import Cell, SweepConfig, done_cells, expected_hash, make_cells
 from learner.tracker import Tracker, git_commit
 from learner.trial import SweepPlace
 from learner.tune_edge import run_cells
@@ -49,43 +49,45 @@ class SweepResults:
         self.cells = make_cells(grid)  # refuses what cannot be, before a folder is made
         mine = read_table(self.table) if self.table.is_file() else []
         self._refuse_other_settings(mine)
-        self._known = [*(read_table(known) if known else []), *mine]
-        self._sittings = list(dict.fromkeys([*(read_sittings(known) if known else []), *read_sittings(self.table)]))
+        given = read_table(known) if known else []
+        taken = [row for row in given if self._fits(row)]
+        self.left_out = len(given) - len(taken)
+        self._known = [*taken, *mine]
+        sittings = [*(read_sittings(known) if known and taken else []), *read_sittings(self.table)]
+        self._sittings = list(dict.fromkeys(sittings))
         make_folder(folder, "--runs-dir")
         self._own = {cell.key: self._read(cell.key) for cell in self.cells}
 
+    def _fits(self, row: ResultRow) -> bool:
+        """Whether a row is of another label, or of this sweep's settings."""
+        return row.preset != self._grid.label or expected_hash(self._grid, row) == row.config
+
     def _refuse_other_settings(self, rows: list[ResultRow]) -> None:
-        newest = self._newest()
         for row in rows:
-            if newest.get(_policy_of(row), row.config) != row.config:
+            if not self._fits(row):
                 raise ConfigError(
                     f"{self.table} holds results of other settings ({row.method} {row.trained_robots}r×"
                     f"{row.trained_groups}g, seed {row.seed}): give this sweep a name of its own with --name, or take "
                     "the table away"
                 )
 
-    def _newest(self) -> dict[tuple[object, ...], str]:
-        """The hash of each cell by what tells a policy from the others."""
-        return {_place(cell, self._grid): cell_hash(cell.config) for cell in self.cells}
-
     def begin_sitting(self) -> None:
-        """Notes that cells are about to run, for `settings.json`."""
+        """Notes in `settings.json` that cells are about to run."""
         sitting = Sitting(sweep_command(self._grid), git_commit())
         self._sittings = [*(each for each in self._sittings if each != sitting), sitting]
+        self.write()
 
     def _read(self, key: str) -> list[ResultRow]:
         table = self.folder / CELLS / key / RESULTS
         return read_table(table) if table.is_file() else []
 
     def _rows(self) -> list[ResultRow]:
-        """All rows: of two of the same evaluation the one of more episodes, none of a cell's former settings."""
+        """All rows: of two of the same evaluation the one of more episodes."""
         own = [row for rows in self._own.values() for row in rows]
-        newest = self._newest()
         best: dict[tuple[object, ...], ResultRow] = {}
         for row in sorted([*self._known, *own], key=lambda row: row.episodes):
-            policy = _policy_of(row)
-            if newest.get(policy, row.config) == row.config:
-                best[*policy, row.robots, row.groups] = row
+            policy = (row.preset, row.policy, row.method, row.trained_robots, row.trained_groups, row.seed)
+            best[*policy, row.robots, row.groups] = row
         return list(best.values())
 
     def finished(self, key: str) -> dict[str, list[ResultRow]]:
@@ -111,15 +113,6 @@ class SweepResults:
         }
         write_json(self.folder / SETTINGS, settings)
         return done_cells(self._grid, self.cells, rows)
-
-
-def _place(cell: Cell, grid: SweepConfig) -> tuple[object, ...]:
-    world = cell.config.world
-    return (grid.label, cell.policy, world.method, world.robots, world.groups, cell.config.seed)
-
-
-def _policy_of(row: ResultRow) -> tuple[object, ...]:
-    return (row.preset, row.policy, row.method, row.trained_robots, row.trained_groups, row.seed)
 
 
 @contextmanager
@@ -175,6 +168,8 @@ def sweep(command: Sweep) -> int:
     results = SweepResults(command.grid, folder, command.known)
     console = Console(file=sys.stdout)  # by name: Tune's own output is kept from sys.stdout while it runs
     console.print(f"sweep {folder}", highlight=False, soft_wrap=True)
+    if results.left_out:
+        console.print(f"{results.left_out} rows of {command.known} are of other settings and left out", highlight=False)
     with _alone_in(folder):
         done = results.write()
         board = make_board(console, results.cells, done)

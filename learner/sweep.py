@@ -181,13 +181,31 @@ def make_cell(sweep: SweepConfig, method: MethodName, robots: int, groups: int, 
 
 
 def world_of_label(label: str, method: MethodName, robots: int, groups: int) -> WorldConfig:
-    """The world in which a sweep of this label plays; that of preset `thesis` where no sweep has such a label."""
+    """The world in which a sweep of this label plays.
+
+    Where there is none, because its settings do not fit this method and setup or the label is no sweep's, that of its
+    preset alone, and that of `thesis` at last.
+    """
     preset, *changed = label.split("+")
+    for name, assignments in ((preset, tuple(changed)), (preset, ())):
+        try:
+            sweep = SweepConfig(preset=cast(PresetName, name), set=assignments)
+            return make_cell(sweep, method, robots, groups, 0).config.world
+        except ConfigError:
+            continue
+    return make_cell(SweepConfig(), method, robots, groups, 0).config.world
+
+
+def expected_hash(sweep: SweepConfig, row: ResultRow) -> str | None:
+    """The hash of the cell whose row this would be with the sweep's settings; None if the sweep could not have it."""
+    setup = (row.trained_robots, row.trained_groups)
     try:
-        sweep = SweepConfig(preset=cast(PresetName, preset), set=tuple(changed))
+        method = cast(MethodName, row.method)
+        if row.policy == LEARNED:
+            return cell_hash(make_cell(sweep, method, *setup, row.seed).config)
+        return cell_hash(make_baseline_cell(sweep, cast(BaselineName, row.policy), method, *setup).config)
     except ConfigError:
-        sweep = SweepConfig()
-    return make_cell(sweep, method, robots, groups, 0).config.world
+        return None
 
 
 def make_cells(sweep: SweepConfig) -> list[Cell]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from actors.estimates import BINOMIAL, Dispersion, dispersion, mean, rate, rate_difference
+from actors.estimates import dispersion, mean, rate, rate_difference, ratio
 
 
 def wilson(count, total):
@@ -72,20 +72,40 @@ def test_a_difference_turned_round_changes_its_sign():
 
 
 def test_counts_that_vary_more_are_worth_fewer_trials():
-    assert rate(300, 1000, Dispersion(5.0)) == pytest.approx(rate(60, 200))
-    wide = stats.t.ppf(0.975, 4) / stats.norm.ppf(0.975)
-    few, many = (rate(50_000, 100_000, Dispersion(1.0, freedom)) for freedom in (4, math.inf))
-    assert few.high - few.low == pytest.approx(wide * (many.high - many.low), rel=1e-3)
+    assert rate(300, 1000, 5.0) == pytest.approx(rate(60, 200))
 
 
-def test_dispersion_is_pearsons_chi_square_of_the_table():
+def test_dispersion_is_pearsons_chi_square_of_the_table_and_students_for_being_an_estimate():
     samples = [[(10, 100), (30, 100)], [(5, 50), (9, 80), (20, 90)]]
     tables = [np.array([(count, total - count) for count, total in pairs]) for pairs in samples]
     chi_square = sum(stats.chi2_contingency(table, correction=False).statistic for table in tables)
-    assert dispersion(samples) == pytest.approx((chi_square / 3, 3))
-    assert dispersion(samples, freedom=2) == pytest.approx((chi_square / 3, 2))
+    for freedom, most in ((3, math.inf), (2, 2)):
+        student = stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975)
+        assert dispersion(samples, most) == pytest.approx(chi_square / 3 * student**2)
 
 
 @pytest.mark.parametrize("samples", [[], [[(3, 10)]], [[(0, 10), (0, 20)], [(10, 10), (5, 5)]], [[(5, 10), (5, 10)]]])
 def test_what_does_not_vary_is_binomial(samples):
-    assert dispersion(samples) == BINOMIAL
+    assert dispersion(samples) == 1.0
+
+
+def test_a_ratio_of_counts_whose_totals_vary_covers_the_truth_as_often_as_it_says():
+    """Strata of very different totals and shares, each of three clusters that differ by more than chance."""
+    rng, strata, hits, naive = np.random.default_rng(3), np.array([(900, 0.8), (300, 0.6), (60, 0.3)] * 4), 0, 0
+    truth = strata.prod(axis=1).sum() / strata[:, 0].sum()
+    for _ in range(1000):
+        samples = []
+        for mean_total, share in strata:
+            totals = rng.poisson(mean_total * rng.uniform(0.5, 1.5, 3))
+            samples.append(list(zip(rng.binomial(totals, rng.normal(share, 0.05, 3)), totals, strict=True)))
+        found = ratio(samples)
+        plain = rate(*np.sum(samples, axis=(0, 1)).tolist())
+        hits += found.low <= truth <= found.high
+        naive += plain.low <= truth <= plain.high
+    assert 0.935 <= hits / 1000 <= 0.975
+    assert naive / 1000 < 0.8
+
+
+def test_a_ratio_without_clusters_is_a_rate():
+    assert ratio([[(3, 10)], [(5, 20)]]) == rate(8, 30)
+    assert ratio([[(5, 10), (5, 10)]]) == rate(10, 20), "never narrower than binomial"

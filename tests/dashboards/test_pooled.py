@@ -48,24 +48,25 @@ def test_one_seed_has_no_range():
     assert cell is not None and success(cell).seed_range is None
 
 
-def test_intervals_over_seeds_cover_the_method_not_these_policies():
-    """Policies whose true rates differ by 5 points: a rate's interval holds the mean of all that could be trained."""
-    rng, truth, cells, hits, binomial = np.random.default_rng(2), 0.8, 5, 0, 0
-    for _ in range(300):
+@pytest.mark.parametrize("rates", [[0.8] * 5, [0.95, 0.85, 0.7, 0.6, 0.4]])
+def test_intervals_over_seeds_cover_the_method_not_these_policies(rates: list[float]):
+    """Policies' true rates vary (beta distributed): a rate's interval holds the mean of all that could be trained."""
+    rng, hits, binomial, rounds = np.random.default_rng(2), 0, 0, 300
+    for _ in range(rounds):
         rows = [
             row("out", Setup(5, groups), success=100 * rng.binomial(3000, share) / 3000, seed=seed)
-            for groups in GROUPS
-            for seed, share in enumerate(rng.normal(truth, 0.05, 3).clip(0, 1))
+            for groups, truth in zip(GROUPS, rates, strict=True)
+            for seed, share in enumerate(rng.beta(60 * truth, 60 * (1 - truth), 3))
         ]
         results = Results(rows)
-        for groups in GROUPS:
+        for groups, truth in zip(GROUPS, rates, strict=True):
             cell = results.fixed("out", Setup(5, groups))
             assert cell is not None
             estimate, naive = success(cell).estimate, rate(cell.count(Outcome.GOAL), cell.episodes)
             hits += estimate.low <= truth <= estimate.high
             binomial += naive.low <= truth <= naive.high
-    assert 0.935 <= hits / (300 * cells) <= 0.965
-    assert binomial / (300 * cells) < 0.4
+    assert 0.93 <= hits / (rounds * len(rates)) <= 0.97
+    assert binomial / (rounds * len(rates)) < 0.4
 
 
 def test_one_method_does_not_widen_another():

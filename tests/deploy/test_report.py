@@ -88,14 +88,27 @@ def test_tables_stand_side_by_side(both: dict[str, bytes], tmp_path: Path):
         write_table(table, [line for line in BOTH if line.preset == table.stem])
     assert report(Report(results=tables, out=tmp_path / "out")) == 0
     page = (tmp_path / "out" / "report.md").read_text()
-    assert page.replace("`thesis.csv`, `best.csv`", "`results.csv`") == both["report.md"].decode()
+    names = ", ".join(f"`{tmp_path.name}/{table.name}`" for table in tables)
+    assert page.replace(names, "`results.csv`") == both["report.md"].decode()
     assert re.search(r"^\| 14 \| .* \| holds \(10 of 10\) \| no data \(1 of 10\) \|$", page, re.MULTILINE)
 
 
-def test_a_policy_in_two_tables_is_refused(tmp_path: Path):
-    write_table(tmp_path / "results.csv", claimed_table())
+def test_a_policy_in_two_tables_counts_once_and_is_refused_where_they_differ(tmp_path: Path):
+    rows = claimed_table()
+    write_table(tmp_path / "results.csv", rows)
+    write_table(tmp_path / "more.csv", [rows[0], *(line._replace(seed=1) for line in rows[1:])])
+    tables = (tmp_path / "results.csv", tmp_path / "more.csv")
+    assert report(Report(results=tables, out=tmp_path / "out")) == 0
+    assert "| 1 … 2 |" in (tmp_path / "out" / "report.md").read_text()
+    write_table(tmp_path / "more.csv", [rows[0]._replace(goal=rows[0].goal - 1, lost=rows[0].lost + 1)])
     with pytest.raises(ConfigError, match="twice"):
-        report(Report(results=(tmp_path / "results.csv",) * 2, out=tmp_path / "out"))
+        report(Report(results=tables, out=tmp_path / "out"))
+
+
+@pytest.mark.parametrize("changed", ["sector_frame=goal", "arena_radius_m=2.0", "learning_rate=1e+3", "no=setting"])
+def test_settings_that_do_not_fit_what_is_drawn_leave_the_report_whole(changed: str, tmp_path: Path):
+    rows = [line._replace(preset=f"thesis+{changed}") for line in claimed_table()[:3]]
+    assert set(made(rows, tmp_path)) == COMMON | {picture.file for picture in PICTURES}
 
 
 def test_a_presets_name_leads_nowhere_else(tmp_path: Path):

@@ -1,12 +1,13 @@
 """What a sweep's `settings.json` tells of how its results came about, and what a sweep's folder keeps out."""
 
+import dataclasses
 import json
 import shlex
 from pathlib import Path
 
 import pytest
 
-from actors.result_table import LEARNED, ResultRow, write_table
+from actors.result_table import LEARNED, ResultRow, read_table, write_table
 from deploy.cli import parse
 from deploy.options import Sweep
 from deploy.sittings import read_sittings, sweep_command
@@ -53,7 +54,7 @@ def test_the_command_of_a_sitting_asks_for_the_same_grid(grid: SweepConfig):
 def test_sittings_are_kept_and_come_with_known_results(tmp_path: Path):
     first = SweepResults(GRID, tmp_path / "first")
     first.begin_sitting()
-    first.write()
+    write_table(first.table, [row_of(GRID)])
     before = read_sittings(tmp_path / "first" / "results.csv")
     assert [sitting.command for sitting in before] == [sweep_command(GRID)]
 
@@ -64,6 +65,24 @@ def test_sittings_are_kept_and_come_with_known_results(tmp_path: Path):
         later.write()
     known = read_sittings(tmp_path / "later" / "results.csv")
     assert [sitting.command for sitting in known] == [sweep_command(GRID), sweep_command(more)]
+
+
+def test_the_one_sitting_that_older_files_tell_of_is_kept(tmp_path: Path):
+    older = {"sweep": dataclasses.asdict(GRID), "commit": "a1d63ee"}
+    (tmp_path / "settings.json").write_text(json.dumps(older))
+    SweepResults(GRID, tmp_path).write()
+    assert read_sittings(tmp_path / "results.csv") == [(sweep_command(GRID), "a1d63ee")]
+
+
+def test_known_results_of_other_settings_are_left_out_and_their_sittings_too(tmp_path: Path):
+    other = dataclasses.replace(GRID, env_steps=250_000)
+    first = SweepResults(other, tmp_path / "first")
+    first.begin_sitting()
+    write_table(tmp_path / "first" / "results.csv", [row_of(other)])
+    later = SweepResults(GRID, tmp_path / "later", tmp_path / "first" / "results.csv")
+    later.write()
+    assert later.left_out == 1 and not read_table(tmp_path / "later" / "results.csv")
+    assert read_sittings(tmp_path / "later" / "results.csv") == []
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"sittings": [1]}', '{"sittings": {"command": "x"}}'])
@@ -84,9 +103,10 @@ def test_a_folder_with_results_of_other_settings_is_left_as_it_is(other: dict[st
     """Each of these once dropped the table's rows without a word."""
     write_table(tmp_path / "results.csv", [row_of(GRID)])
     before = (tmp_path / "results.csv").read_bytes()
-    changed = SweepConfig(methods=("sensor", "out"), robots=(5, 10), groups=(1,), seeds=(1,), **other)
-    with pytest.raises(ConfigError, match="5r×1g, seed 1.*--name"):
-        SweepResults(changed, tmp_path)
+    for robots in ((5, 10), (15,)):  # whether this sweep has the cell or not
+        changed = dataclasses.replace(GRID, robots=robots, **other)
+        with pytest.raises(ConfigError, match="5r×1g, seed 1.*--name"):
+            SweepResults(changed, tmp_path)
     assert (tmp_path / "results.csv").read_bytes() == before
     SweepResults(GRID, tmp_path).write()
     assert (tmp_path / "results.csv").read_bytes() == before

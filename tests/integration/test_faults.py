@@ -58,7 +58,7 @@ def test_metrics_of_an_outage_of_mlflow_arrive_later_and_once(server, tmp_path):
 @pytest.mark.ray
 @pytest.mark.timeout(900)
 def test_a_run_reaches_its_target_whatever_is_killed(shoal):
-    schedule = ("--env-steps", "300000", "--faults", "5", "--every-s", "2", "--seed", "1")
+    schedule = ("--env-steps", "400000", "--faults", "5", "--every-s", "2", "--seed", "1")
     done = shoal("chaos", "--out", "chaos", *schedule, timeout_s=880)
     assert done.returncode == 0, done.stdout + done.stderr
     end = re.search(r"(\d+) faults; target reached, accounts balance, MLflow has every row once", done.stdout)
