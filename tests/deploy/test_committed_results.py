@@ -13,7 +13,7 @@ from actors.result_table import LEARNED, read_table
 from deploy.cli import main
 from deploy.sittings import read_sittings
 from learner.config import RunConfig, to_dict
-from learner.sweep import SweepConfig, cell_hash, make_cell
+from learner.sweep import SweepConfig, cell_hash, expected_hash, make_cell
 
 ROOT = Path(dashboards.__file__).parent / "results"
 FOLDERS = sorted(path.parent for path in ROOT.glob("*/results.csv"))
@@ -79,3 +79,16 @@ def test_no_default_has_moved_under_the_results(folder):
         for name in values.keys() - {"world", "seed"} & RunConfig.__dataclass_fields__.keys():
             assert now[name] == values[name], name
         assert {name: now["world"][name] for name in values["world"]} == values["world"]
+
+
+TRIED = sorted((ROOT / "tried").glob("*.csv"))
+
+
+@pytest.mark.parametrize("table", TRIED, ids=lambda table: table.stem)
+def test_what_was_tried_is_what_its_label_says(table):
+    rows = read_table(table)
+    assert rows
+    for row in rows:
+        preset, *changed = row.preset.split("+")
+        sweep = SweepConfig(preset=preset, set=tuple(changed), episodes=600, first_seed=3_000_000_000)
+        assert row.config == expected_hash(sweep, row)
