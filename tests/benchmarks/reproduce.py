@@ -1,6 +1,7 @@
 """`make reproduce`: trains some cells of the committed results anew, and says whether they land where those let expect.
 
-On a machine with the same arithmetic all counts are the same; elsewhere one training in twenty lands outside by chance.
+With the arithmetic and the learning code of the sitting that made a cell its counts are the same; else one training in
+twenty lands outside by chance.
 """
 
 import argparse
