@@ -108,6 +108,11 @@ def _joined(first: float, second: float, correlation: float) -> float:
     return float(np.sqrt(max(first**2 + second**2 - 2 * correlation * first * second, 0.0)))
 
 
+def _kind(method: str, trained: Setup, played: Setup) -> tuple[str, int, bool]:
+    """Cells of one kind share how much seeds differ: method, robots of the training, whether Fixed."""
+    return method, trained.robots, trained == played
+
+
 def _spread_over_seeds(cells: Sequence[Sequence[ResultRow]]) -> dict[Outcome, float]:
     """How much the counts of cells, each a row a seed, vary over seeds; one policy in many setups is one seed."""
     policies = {(row.trained_robots, row.trained_groups, row.seed) for rows in cells for row in rows}
@@ -139,13 +144,10 @@ class Results:
                 "make the table again",
             )
         kin: dict[tuple[str, int, bool], list[list[ResultRow]]] = {}
-        for (method, trained, played), same in found.items():
-            kin.setdefault((method, trained.robots, trained == played), []).append(same)
-        spreads = {key: _spread_over_seeds(cells) for key, cells in kin.items()}
-        self._cells = {
-            (method, trained, played): Cell(tuple(same), spreads[method, trained.robots, trained == played])
-            for (method, trained, played), same in found.items()
-        }
+        for key, same in found.items():
+            kin.setdefault(_kind(*key), []).append(same)
+        spreads = {kind: _spread_over_seeds(cells) for kind, cells in kin.items()}
+        self._cells = {key: Cell(tuple(same), spreads[_kind(*key)]) for key, same in found.items()}
 
     def fixed(self, method: str, setup: Setup) -> Cell | None:
         """The cell trained and played in `setup`, None if it is missing."""

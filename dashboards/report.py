@@ -74,10 +74,12 @@ def verdicts_side_by_side(parts: Sequence[PresetPart]) -> list[str]:
     header = ("#", "claim", *(part.name for part in parts))
     rows = []
     for claims in zip(*(part.claims for part in parts), strict=True):
-        held = (len(with_verdict(claim.checks, Verdict.HOLDS)) for claim in claims)
-        found = (f"{claim.verdict} ({n} of {len(claim.checks)})" for claim, n in zip(claims, held, strict=True))
-        rows.append((str(claims[0].number), claims[0].text, *found))
+        rows.append((str(claims[0].number), claims[0].text, *map(_verdict_in_short, claims)))
     return table_of(header, rows)
+
+
+def _verdict_in_short(claim: Claim) -> str:
+    return f"{claim.verdict} ({len(with_verdict(claim.checks, Verdict.HOLDS))} of {len(claim.checks)})"
 
 
 def _coverage(parts: Sequence[PresetPart]) -> list[str]:

@@ -31,9 +31,8 @@ def find_policy(folder: RunFolder, config: RunConfig, which: str = NEWEST) -> We
     """
     shape = env_shape(config.env)
     is_swept = folder.results.is_file() or not (folder.checkpoints.exists() or folder.storage().checkpoint_url)
-    if (
-        folder.policy.is_file() and is_swept and which in (NEWEST, BEST)
-    ):  # of a cell that is done, only the policy is kept
+    is_named = which not in (NEWEST, BEST)
+    if folder.policy.is_file() and is_swept and not is_named:  # of a cell that is done, only the policy is kept
         return read_saved_policy(folder.policy, config, shape)
     return read_policy(_checkpoint(folder, which), config, shape)
 
@@ -42,8 +41,8 @@ def _checkpoint(folder: RunFolder, which: str) -> Checkpoint:
     root = folder.checkpoint_location()
     if which not in (NEWEST, BEST):
         return valid_named(root, which)
-    found = newest_valid(root) if which == NEWEST else best_valid(root, scores_of(read_rows(folder.journal)))
-    checkpoint, skipped = found
+    scores = scores_of(read_rows(folder.journal)) if which == BEST else None
+    checkpoint, skipped = newest_valid(root) if scores is None else best_valid(root, scores)
     for reason in skipped:
         Console(stderr=True).print(f"skipped: {reason}", markup=False, highlight=False, soft_wrap=True)
     return checkpoint

@@ -39,12 +39,18 @@ def read_sittings(table: Path) -> list[Sitting]:
     try:
         stored = json.loads((table.parent / SETTINGS).read_text())
         if "sittings" not in stored:
-            return [Sitting(sweep_command(_grid_of(stored["sweep"])), str(stored["commit"]))]
+            return [Sitting(sweep_command(grid_of(stored["sweep"])), str(stored["commit"]))]
         return [Sitting(str(each["command"]), str(each["commit"])) for each in stored["sittings"]]
     except (OSError, ValueError, KeyError, TypeError):
         return []
 
 
-def _grid_of(values: dict[str, Any]) -> SweepConfig:
+def grid_of(values: dict[str, Any]) -> SweepConfig:
+    """The grid that `settings.json` stores as `sweep`.
+
+    Raises:
+      TypeError: a later version has no such setting.
+      ConfigError: a value is out of range.
+    """
     plain: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
     return SweepConfig(**plain)

@@ -75,7 +75,7 @@ class SweepResults:
         """Notes in `settings.json` that cells are about to run."""
         sitting = Sitting(sweep_command(self._grid), git_commit())
         self._sittings = [*(each for each in self._sittings if each != sitting), sitting]
-        self.write()
+        self._write_settings()
 
     def _read(self, key: str) -> list[ResultRow]:
         table = self.folder / CELLS / key / RESULTS
@@ -91,9 +91,9 @@ class SweepResults:
         return list(best.values())
 
     def finished(self, key: str) -> dict[str, list[ResultRow]]:
-        """Reads the table of a cell that has just finished, and writes all; see `write`."""
+        """Reads the table of a cell that has just finished, and writes that of all; see `write`."""
         self._own[key] = self._read(key)
-        return self.write()
+        return self._write_table()
 
     def write(self) -> dict[str, list[ResultRow]]:
         """Writes `results.csv`, all rows of the sweep's sittings, and `settings.json`, how they came about.
@@ -101,8 +101,15 @@ class SweepResults:
         Returns:
           The results of every finished cell, by key.
         """
+        self._write_settings()
+        return self._write_table()
+
+    def _write_table(self) -> dict[str, list[ResultRow]]:
         rows = self._rows()
         write_table(self.table, rows)
+        return done_cells(self._grid, self.cells, rows)
+
+    def _write_settings(self) -> None:
         trained = [cell.config for cell in self.cells if cell.policy == LEARNED]
         examples = {config.world.method: to_dict(config) for config in reversed(trained)}
         sittings = [sitting._asdict() for sitting in self._sittings]
@@ -112,7 +119,6 @@ class SweepResults:
             "a_cell_of_each_method": examples,
         }
         write_json(self.folder / SETTINGS, settings)
-        return done_cells(self._grid, self.cells, rows)
 
 
 @contextmanager

@@ -180,17 +180,25 @@ def make_cell(sweep: SweepConfig, method: MethodName, robots: int, groups: int, 
     return Cell(f"{method}-{robots}r{groups}g-s{seed}-{cell_hash(config)}", config)
 
 
+def sweep_of_label(label: str) -> SweepConfig:
+    """A sweep of this label, its grid and its evaluations as by default.
+
+    Raises:
+      ConfigError: the label is no sweep's.
+    """
+    preset, *changed = label.split("+")
+    return SweepConfig(preset=cast(PresetName, preset), set=tuple(changed))
+
+
 def world_of_label(label: str, method: MethodName, robots: int, groups: int) -> WorldConfig:
     """The world in which a sweep of this label plays.
 
     Where there is none, because its settings do not fit this method and setup or the label is no sweep's, that of its
     preset alone, and that of `thesis` at last.
     """
-    preset, *changed = label.split("+")
-    for name, assignments in ((preset, tuple(changed)), (preset, ())):
+    for known in (label, label.split("+")[0]):
         try:
-            sweep = SweepConfig(preset=cast(PresetName, name), set=assignments)
-            return make_cell(sweep, method, robots, groups, 0).config.world
+            return make_cell(sweep_of_label(known), method, robots, groups, 0).config.world
         except ConfigError:
             continue
     return make_cell(SweepConfig(), method, robots, groups, 0).config.world

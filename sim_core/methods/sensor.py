@@ -77,9 +77,9 @@ def _goal_direction(state, world, robots):
 
 
 @kernel
-def _turn_to_goal(state, out_x, out_y, robots):
+def _turn_to_goal(state, out_x, out_y, params):
     for world in range(out_x.shape[0]):
-        cos, sin = _goal_direction(state, world, robots)
+        cos, sin = _goal_direction(state, world, params[0].robots)
         x, y = out_x[world], out_y[world]
         out_x[world], out_y[world] = cos * x - sin * y, sin * x + cos * y
 
@@ -154,7 +154,7 @@ class SensorMethod(Method):
         """Takes its constants from `config`."""
         separate = config.sensor_counts == "separate"
         self.observation_shape = ((4 if separate else 2) * config.sectors,)
-        self._robots, self._faces_goal = config.robots, config.sector_frame == "goal"
+        self._faces_goal = config.sector_frame == "goal"
         self._velocities = heading_velocities(config, np.float32)
         self._edges = sector_edges(config.sectors)
         real = np.float32
@@ -163,7 +163,7 @@ class SensorMethod(Method):
                 robots=config.robots,
                 sectors=config.sectors,
                 separate=separate,
-                faces_goal=config.sector_frame == "goal",
+                faces_goal=self._faces_goal,
                 inner_sq=real(config.inner_radius_m) ** 2,
                 outer_sq=real(config.outer_radius_m) ** 2,
                 outer_m=real(config.outer_radius_m),
@@ -184,7 +184,7 @@ class SensorMethod(Method):
         """
         write_headings(self._velocities, action, out_x, out_y)
         if self._faces_goal:
-            _turn_to_goal(state, out_x, out_y, self._robots)
+            _turn_to_goal(state, out_x, out_y, self._params)
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
         """3.2.1: `[num_worlds, 2q]` counts, the inner disc's q first; apart, 2q of the own group, then 2q of others."""

@@ -41,16 +41,7 @@ def drawn(rows: list[ResultRow], cells: int, seed: int) -> list[ResultRow]:
 
 def trained_anew(row: ResultRow, folder: Path) -> ResultRow:
     """The same cell's Fixed row by a sweep of its own."""
-    setup = [
-        "--methods",
-        row.method,
-        "--robots",
-        str(row.robots),
-        "--groups",
-        str(row.groups),
-        "--seeds",
-        str(row.seed),
-    ]
+    setup = f"--methods {row.method} --robots {row.robots} --groups {row.groups} --seeds {row.seed}".split()
     whole = ["--preset", row.preset, "--extrapolation", "none", "--baselines", "--runs-dir", str(folder), "--name", "s"]
     assert shoal(["sweep", *setup, *whole]) == 0
     (found,) = read_table(folder / "sweeps" / "s" / "results.csv")

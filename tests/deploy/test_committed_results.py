@@ -1,5 +1,6 @@
 """The committed results: `shoal report` makes the committed report of them, and the presets are still theirs."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -11,18 +12,16 @@ from PIL import Image
 import dashboards
 from actors.result_table import LEARNED, read_table
 from deploy.cli import main
-from deploy.sittings import read_sittings
+from deploy.sittings import grid_of, read_sittings
 from learner.config import RunConfig, to_dict
-from learner.sweep import SweepConfig, cell_hash, expected_hash, make_cell
+from learner.sweep import expected_hash, make_cell, sweep_of_label
 
 ROOT = Path(dashboards.__file__).parent / "results"
 FOLDERS = sorted(path.parent for path in ROOT.glob("*/results.csv"))
 
 
 def sweep_of(folder):
-    values = json.loads((folder / "settings.json").read_text())["sweep"]
-    plain = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
-    return SweepConfig(**plain)
+    return grid_of(json.loads((folder / "settings.json").read_text())["sweep"])
 
 
 def test_there_are_results():
@@ -62,8 +61,7 @@ def test_the_rows_are_of_the_preset_as_it_is(folder):
     assert rows
     for row in rows:
         assert row.preset == sweep.label
-        cell = make_cell(sweep, row.method, row.trained_robots, row.trained_groups, row.seed)
-        assert row.config == cell_hash(cell.config)
+        assert row.config == expected_hash(sweep, row)
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
@@ -89,6 +87,5 @@ def test_what_was_tried_is_what_its_label_says(table):
     rows = read_table(table)
     assert rows
     for row in rows:
-        preset, *changed = row.preset.split("+")
-        sweep = SweepConfig(preset=preset, set=tuple(changed), episodes=600, first_seed=3_000_000_000)
+        sweep = dataclasses.replace(sweep_of_label(row.preset), episodes=600, first_seed=3_000_000_000)
         assert row.config == expected_hash(sweep, row)
