@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from actors.result_table import LEARNED, ResultRow
-from dashboards.claim_checks import Claim, Verdict, with_verdict
-from dashboards.claim_text import NOTE, table_of, tally, verdict_table
-from dashboards.diagrams import DIAGRAMS
-from dashboards.example_episodes import EXAMPLES
-from dashboards.pooled import METHOD_NAMES, NUM_CELLS, SETUPS, Results, Setup, success
-from dashboards.result_figures import PICTURES
+from actors.evaluation.result_table import LEARNED, ResultRow
+from dashboards.analysis.aggregate import METHOD_NAMES, NUM_CELLS, SETUPS, Results, Setup, success
+from dashboards.analysis.claim_checks import Claim, Verdict, with_verdict
+from dashboards.analysis.claim_text import NOTE, table_of, tally, verdict_table
+from dashboards.figures.diagrams import DIAGRAMS
+from dashboards.figures.example_episodes import EXAMPLES
+from dashboards.figures.result_figures import PICTURES
 
 DRAWINGS = (*EXAMPLES, *DIAGRAMS)
 """What is drawn from live worlds, beside the pictures of results."""

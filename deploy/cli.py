@@ -16,12 +16,12 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import tyro  # noqa: E402
 
-from actors.faults import RunFailed  # noqa: E402
-from deploy.options import Chaos, Resume, Submit, Sweep, Train, ray_address  # noqa: E402
-from deploy.result_options import Dashboard, Evaluate, Export, Report, Watch  # noqa: E402
+from actors.service.fault_policy import RunFailed  # noqa: E402
+from deploy.options.results import Dashboard, Evaluate, Export, Report, Watch  # noqa: E402
+from deploy.options.training import Chaos, Resume, Submit, Sweep, Train, ray_address  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
 from learner.presets import PresetName, preset_config  # noqa: E402
-from learner.ray_auth import guard_ray  # noqa: E402
+from learner.ray_backend.auth import guard_ray  # noqa: E402
 from sim_core.checks import ConfigError, require  # noqa: E402
 from sim_core.config import MethodName  # noqa: E402
 
@@ -131,34 +131,34 @@ def execute(command: Command) -> int:
     """Runs a command; returns its exit code. Imports are late: help must not wait for Ray and MLflow."""
     guard_ray(_joins_cluster(command))  # which Ray reads when it is imported
     if isinstance(command, Train | Resume):
-        from deploy import training
+        from deploy.commands import train as training
 
         return training.train(command) if isinstance(command, Train) else training.resume(command)
     if isinstance(command, Sweep):
-        from deploy.sweep import sweep
+        from deploy.commands.sweep import sweep
 
         return sweep(command)
     if isinstance(command, Submit):
-        from deploy.submit import submit
+        from deploy.commands.submit import submit
 
         return submit(command, cast("Train | Sweep", parse(command.command)))
     if isinstance(command, Report):
-        from deploy.report import report
+        from deploy.commands.report import report
 
         return report(command)
     if isinstance(command, Chaos):
-        from deploy.chaos import chaos
+        from deploy.chaos.run import chaos
 
         return chaos(command)
     if isinstance(command, Export):
-        from deploy.export import export
+        from deploy.commands.export import export
 
         return export(command)
     if isinstance(command, Dashboard):
-        from deploy.dashboard import dashboard
+        from deploy.commands.dashboard import dashboard
 
         return dashboard(command)
-    from deploy import playing
+    from deploy.commands import evaluate as playing
 
     return playing.evaluate(command) if isinstance(command, Evaluate) else playing.watch(command)
 

@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from actors.evaluator import record_episode
-from dashboards.player import player_data, player_page
-from dashboards.server import PageServer
-from dashboards.web_assets import SERVED
-from deploy.policies import NewestPolicy
+from actors.evaluation.evaluator import record_episode
+from dashboards.pages.assets import SERVED
+from dashboards.pages.player import player_data, player_page
+from dashboards.pages.server import PageServer
+from deploy.runs.policy_lookup import NewestPolicy
 from learner.config import RunConfig
-from learner.journal import read_rows
 from learner.run_folder import RunFolder
+from learner.tracking.journal import read_rows
 from sim_core.checks import ConfigError, require
 
 if TYPE_CHECKING:
-    from deploy.result_options import Watch
+    from deploy.options.results import Watch
 
 
 class LiveRun:

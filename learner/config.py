@@ -9,8 +9,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from actors.exploration import Exploration
-from actors.vector_env import EnvSpec
+from actors.rollout.exploration import Exploration
+from actors.rollout.vector_env import EnvSpec
 from sim_core import ENV_ID
 from sim_core.checks import ConfigError, check_fields, require
 from sim_core.config import WorldConfig
@@ -169,7 +169,7 @@ class RunConfig:
 
     @property
     def policy_sizes(self) -> tuple[int, ...]:
-        """Hidden sizes of the plain network that the learned policy acts with (see actors.network.snapshot)."""
+        """Hidden sizes of the plain network that the learned policy acts with (see actors.policy.network.snapshot)."""
         *shared, last = self.hidden_sizes
         return (*shared, 2 * last) if self.network == "dueling" else self.hidden_sizes
 

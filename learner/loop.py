@@ -9,24 +9,24 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from actors.evaluator import evaluate
-from actors.exploration import epsilon
-from actors.faults import CallFailed, Part, PartFailed, PartKind, Recovery
-from actors.locations import Location
-from actors.network import WeightsSnapshot
-from actors.transitions import BlockReport, EpisodeStats
-from learner.checkpoint import Checkpoint
-from learner.checkpointer import Checkpointer
-from learner.cluster import Cluster
+from actors.evaluation.evaluator import evaluate
+from actors.policy.network import WeightsSnapshot
+from actors.rollout.exploration import epsilon
+from actors.service.fault_policy import CallFailed, Part, PartFailed, PartKind, Recovery
+from actors.service.messages import BlockReport, EpisodeStats
+from actors.storage.uri import Location
+from learner.checkpoints.checkpoint import Checkpoint
+from learner.checkpoints.writer import Checkpointer
 from learner.config import RunConfig
-from learner.journal import Journal, Row
-from learner.ledger import Ledger
-from learner.mending import FaultObserver, Mender, RunLost
-from learner.pacing import make_pacer
-from learner.progress import Progress
-from learner.results import as_metrics, summarise
-from learner.saver import LEARNER, SaveObserver, Saver
-from learner.under_way import Pending, UnderWay
+from learner.tracking.journal import Journal, Row
+from learner.training.cluster import Cluster
+from learner.training.counters import Progress
+from learner.training.evaluation_summary import as_metrics, summarise
+from learner.training.in_flight import Pending, UnderWay
+from learner.training.ledger import Ledger
+from learner.training.pacing import make_pacer
+from learner.training.recovery import FaultObserver, Mender, RunLost
+from learner.training.saver import LEARNER, SaveObserver, Saver
 
 EVAL_SEED = 1_000_000_000
 """First seed of evaluations during training; training worlds draw theirs from other streams."""

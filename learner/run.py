@@ -6,30 +6,29 @@ from collections.abc import Callable
 from contextlib import closing
 from typing import NamedTuple
 
-from actors.evaluator import evaluate_in_parts
-from actors.faults import CallFailed, PartFailed, Recovery, RunFailed, first_line
-from actors.locations import Location
-from actors.network import WeightsSnapshot
-from actors.transitions import EpisodeStats
-from learner.addresses import hide_secrets
-from learner.checkpoint import Checkpoint, newest_valid
-from learner.cluster import Cluster, process_cluster
+from actors.evaluation.evaluator import evaluate_in_parts
+from actors.policy.network import WeightsSnapshot
+from actors.service.fault_policy import CallFailed, PartFailed, Recovery, RunFailed, first_line
+from actors.service.messages import EpisodeStats
+from actors.storage.uri import Location
+from learner.checkpoints.checkpoint import Checkpoint, check_config, check_state, newest_valid
+from learner.checkpoints.manifest import CheckpointError, UselessCheckpointError
 from learner.config import RunConfig
-from learner.delivery import Delivery, insist
-from learner.fault_log import FaultLog
-from learner.journal import Journal, PushedMark, Row
+from learner.file_names import CONFIG
 from learner.loop import TrainingLoop
-from learner.manifest import CheckpointError, UselessCheckpointError
-from learner.mending import RunLost
-from learner.observer import Display, MirroringObserver
-from learner.place import Place
-from learner.ray_edge import ray_cluster
-from learner.ray_metrics import RayMetrics
-from learner.results import Evaluation, as_metrics, summarise
+from learner.ray_backend.cluster import ray_cluster
+from learner.ray_backend.metrics import RayMetrics
 from learner.run_folder import RunFolder
-from learner.saved_state import check_config, check_state
-from learner.stopping import stop_on_signals
-from learner.tracker import TROUBLE, Tracker
+from learner.tracking.delivery import Delivery, insist
+from learner.tracking.fault_log import FaultLog
+from learner.tracking.journal import Journal, PushedMark, Row
+from learner.tracking.mlflow_run import TROUBLE, Tracker
+from learner.tracking.observer import Display, MirroringObserver
+from learner.tracking.redaction import hide_secrets
+from learner.training.cluster import Cluster, Place, process_cluster
+from learner.training.evaluation_summary import Evaluation, as_metrics, summarise
+from learner.training.recovery import RunLost
+from learner.training.stop_signals import stop_on_signals
 
 LAST_FLUSH_S = 5.0
 """How long a stopped run waits for MLflow; the next sitting delivers what it did not take."""
@@ -69,7 +68,7 @@ def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list
     """
     checkpoint, skipped = newest_valid(folder.checkpoint_location())
     check_state(checkpoint)
-    check_config(checkpoint, config, folder.path / "config.json")
+    check_config(checkpoint, config, folder.path / CONFIG)
     return checkpoint, skipped
 
 

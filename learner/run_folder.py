@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from actors.locations import Location, as_location
+from actors.storage.uri import Location, as_location
+from learner import file_names
 from learner.config import RunConfig, from_dict, to_dict
 from sim_core.checks import ConfigError, require
 
@@ -40,14 +41,14 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path.absolute()
-        self.checkpoints = self.path / "checkpoints"
-        self.journal = self.path / "metrics.jsonl"
-        self.pushed = self.path / "metrics.pushed"
-        self.faults = self.path / "faults.jsonl"
-        self.artifacts = self.path / "artifacts"
-        self.policy = self.path / "policy.safetensors"
-        self.results = self.path / "results.csv"
-        self._identity = self.path / "run.json"
+        self.checkpoints = self.path / file_names.CHECKPOINTS
+        self.journal = self.path / file_names.JOURNAL
+        self.pushed = self.path / file_names.PUSHED
+        self.faults = self.path / file_names.FAULTS
+        self.artifacts = self.path / file_names.ARTIFACTS
+        self.policy = self.path / file_names.POLICY
+        self.results = self.path / file_names.RESULTS
+        self._identity = self.path / file_names.IDENTITY
 
     def has_begun(self) -> bool:
         """Whether a run has been started here, so far that it can go on."""
@@ -61,7 +62,7 @@ class RunFolder:
           ConfigError: another process holds it.
         """
         self.path.mkdir(parents=True, exist_ok=True)
-        with (self.path / "lock").open("w") as file:
+        with (self.path / file_names.LOCK).open("w") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
@@ -70,7 +71,7 @@ class RunFolder:
 
     def save_config(self, config: RunConfig) -> None:
         """Writes `config.json`."""
-        write_json(self.path / "config.json", to_dict(config))
+        write_json(self.path / file_names.CONFIG, to_dict(config))
 
     def config(self) -> RunConfig:
         """Reads `config.json`.
@@ -78,11 +79,11 @@ class RunFolder:
         Raises:
           ConfigError: the file is missing, no JSON, or holds another version's config.
         """
-        return from_dict(_read(self.path / "config.json"))
+        return from_dict(_read(self.path / file_names.CONFIG))
 
     def save_storage(self, storage: Storage) -> None:
         """Writes `storage.json`."""
-        write_json(self.path / "storage.json", storage._asdict())
+        write_json(self.path / file_names.STORAGE, storage._asdict())
 
     def storage(self) -> Storage:
         """Reads `storage.json`; a run without one has its checkpoints in its folder.
@@ -90,7 +91,7 @@ class RunFolder:
         Raises:
           ConfigError: the file is damaged.
         """
-        path = self.path / "storage.json"
+        path = self.path / file_names.STORAGE
         if not path.exists():
             return Storage()
         try:
@@ -131,9 +132,9 @@ def find_run(name: str, runs_dir: Path) -> RunFolder:
       ConfigError: there is none.
     """
     for path in (Path(name), runs_dir / name):
-        if (path / "config.json").is_file():
+        if (path / file_names.CONFIG).is_file():
             return RunFolder(path)
-    known = sorted(path.parent.name for path in runs_dir.glob("*/config.json"))
+    known = sorted(path.parent.name for path in runs_dir.glob(f"*/{file_names.CONFIG}"))
     hint = f"runs there: {', '.join(known[-5:])}" if known else f"there are no runs in {runs_dir}"
     raise ConfigError(f"there is no run {name!r}; {hint}")
 

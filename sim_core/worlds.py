@@ -12,10 +12,10 @@ from sim_core.methods import make_method
 from sim_core.outcomes import Outcome
 from sim_core.packed import packed
 from sim_core.rng import world_streams
-from sim_core.scenario import scenario_params
 from sim_core.state import WorldState, empty_state
-from sim_core.step import advance, restart, swarm_params
-from sim_core.tile import world_tile
+from sim_core.swarm.scenario import scenario_params
+from sim_core.swarm.step import advance, restart, swarm_params
+from sim_core.swarm.tile import world_tile
 
 
 class StepResult(NamedTuple):

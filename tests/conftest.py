@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from learner.ray_auth import guard_ray
+from learner.ray_backend.auth import guard_ray
 
 guard_ray(joins=False)  # as `shoal` does: Ray reads this once, when the first test module imports it
 

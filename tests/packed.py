@@ -3,8 +3,8 @@
 import numpy as np
 from gymnasium.spaces import Box
 
-from actors.packing import Packed, packed_dtype
-from actors.transitions import transition_dtype
+from actors.service.messages import transition_dtype
+from actors.service.packing import Packed, packed_dtype
 
 
 def pack(transitions, next_row=None):

@@ -4,7 +4,7 @@ const element = id => document.getElementById(id);
 const canvas = element("canvas"), context = canvas.getContext("2d");
 const ARROW_S = 0.6;  // an arrow ends where the robot would be after this time
 const show = {sensing: true, ellipses: true, velocity: false, machine: false, planes: false, follow: false};
-let data = null;     // the episode as dashboards/player.py gives it
+let data = null;     // the episode as dashboards/pages/player.py gives it
 let numRobots = 0, learnerGroup = 0, positions = null, machine = null, actions = null;
 let selected = 0;    // the robot whose ORCA lines are shown
 let step = 0;        // fractional while playing

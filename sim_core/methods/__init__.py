@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from sim_core.config import WorldConfig
 from sim_core.methods.base import Method
-from sim_core.methods.inside import InsideMethod
-from sim_core.methods.outside import OutsideMethod
-from sim_core.methods.sensor import SensorMethod
+from sim_core.methods.m_in import InsideMethod
+from sim_core.methods.m_out import OutsideMethod
+from sim_core.methods.m_sensor import SensorMethod
 
 METHODS: dict[str, type[Method]] = {"sensor": SensorMethod, "in": InsideMethod, "out": OutsideMethod}
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from actors.network import WeightsSnapshot
-from actors.vector_env import EnvSpec, env_shape
+from actors.policy.network import WeightsSnapshot
+from actors.rollout.vector_env import EnvSpec, env_shape
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig
 

@@ -9,7 +9,7 @@ from pathlib import Path
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-from learner.ray_auth import guard_ray  # noqa: E402
+from learner.ray_backend.auth import guard_ray  # noqa: E402
 from tests.benchmarks import simulator  # noqa: E402
 
 BENCHMARKS = ("simulator", "replay", "learner", "service", "scaling", "profile", "export", "checkpoints")

@@ -9,9 +9,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from actors.rollout import join_stats
-from actors.shard_node import ShardNode, ShardSettings
-from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
+from actors.replay.node import ShardNode, ShardSettings
+from actors.rollout.worker import join_stats
+from actors.service.messages import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
 from learner.config import RunConfig
 from tests.benchmarks.ray_service import ray_service
 from tests.benchmarks.timing import spread

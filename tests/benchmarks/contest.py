@@ -16,11 +16,11 @@ import gymnasium as gym
 import numpy as np
 
 import sim_core  # noqa: F401  registers our environment, in whatever process this is
-from actors.evaluator import evaluate
-from actors.network import WeightsSnapshot, snapshot
-from actors.vector_env import EnvSpec
+from actors.evaluation.evaluator import evaluate
+from actors.policy.network import WeightsSnapshot, snapshot
+from actors.rollout.vector_env import EnvSpec
 from learner.config import RunConfig, from_dict, to_dict
-from learner.results import score, summarise
+from learner.training.evaluation_summary import score, summarise
 
 WARM_S = 3.0
 """From the first update to the start of the count, where a rate is measured."""

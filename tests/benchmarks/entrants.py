@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from rich.console import Console
 
-from actors.vector_env import env_shape
+from actors.rollout.vector_env import env_shape
 from learner.config import RunConfig, from_dict
 from sim_core.config import WorldConfig
 from tests.benchmarks.contest import Finding, Heat

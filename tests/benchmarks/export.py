@@ -12,14 +12,14 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from actors.baselines import Baseline
-from actors.network import QNetwork, snapshot
+from actors.policy.baselines import Baseline
+from actors.policy.network import QNetwork, snapshot
 from learner.config import RunConfig
-from learner.export import ONNX, PROGRAM, Agreement, onnx_session, write_export
-from learner.export_ports import robot_inputs, robot_outputs
-from learner.onboard import make_robot
+from learner.export.ports import robot_inputs, robot_outputs
+from learner.export.reference_states import Sensed, swarm_states
+from learner.export.robot_policy import make_robot
+from learner.export.write import ONNX, PROGRAM, Agreement, onnx_session, write_export
 from learner.presets import preset_config
-from learner.sensed import Sensed, swarm_states
 from sim_core.methods import make_method
 from tests.benchmarks.timing import Timed, ratio, spread, timed_rates
 

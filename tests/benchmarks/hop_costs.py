@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import ray
 
-from actors.network import WeightsSnapshot
-from actors.rollout import RolloutWorker
-from actors.shard_node import make_shard
-from actors.transitions import TransitionBlock
-from actors.vector_env import env_shape
-from learner.cluster import learner_settings, rollout_settings, shard_settings
+from actors.policy.network import WeightsSnapshot
+from actors.replay.node import make_shard
+from actors.rollout.vector_env import env_shape
+from actors.rollout.worker import RolloutWorker
+from actors.service.messages import TransitionBlock
 from learner.config import RunConfig
-from learner.learner import Learner
-from learner.ray_edge import connect, leave
+from learner.ray_backend.cluster import connect, leave
+from learner.training.cluster import learner_settings, rollout_settings, shard_settings
+from learner.update.learner import Learner
 from tests.benchmarks.service import learner_work, worker_work
 from tests.benchmarks.service_model import Costs
 from tests.benchmarks.timing import spread, stopwatch, timed_rates

@@ -9,11 +9,11 @@ from gymnasium.spaces import Box
 from rich.console import Console
 from rich.table import Table
 
-from actors.network import QNetwork
-from actors.transitions import transition_dtype
-from learner.double_dqn import as_batch, mean_loss, targets
-from learner.learner import Columns, Learner
-from learner.updates import LearnerSettings
+from actors.policy.network import QNetwork
+from actors.service.messages import transition_dtype
+from learner.update.double_dqn import as_batch, mean_loss, targets
+from learner.update.learner import Columns, Learner
+from learner.update.updates import LearnerSettings
 from tests.benchmarks.timing import ratio, spread, stopwatch, timed_rates
 
 SHAPES = (((16, 64, 64, 8), 64), ((16, 64, 64, 8), 256), ((16, 128, 128, 8), 256), ((72, 128, 128, 9), 256))

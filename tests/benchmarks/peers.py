@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from learner.config import RunConfig
-from learner.ray_auth import guard_ray
+from learner.ray_backend.auth import guard_ray
 from tests.benchmarks.contest import Finding
 from tests.benchmarks.entrants import LIMIT, OURS, Contender, Contest, Entry, contenders, contests
 from tests.benchmarks.timing import ratio, spread

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from deploy.chaos_processes import TITLES
+from deploy.chaos.processes import TITLES
 
 SPY = "profiler"
 

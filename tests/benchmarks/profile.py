@@ -30,13 +30,20 @@ Shares = dict[tuple[str, str], float]
 """Of each process and work, the share of all CPU time."""
 Samples = dict[int, Counter[str]]
 """Of each thread, by its id, how often it was seen at what."""
-REPLAY = ("replay", "prioritised", "sum_tree", "packing", "frame_ring", "ring_snapshot", "shard_node")
 WORK = (
     ("simulation", ("sim_core/",)),
-    ("policy", ("actors/network.py", "actors/perceptron.py", "actors/exploration.py")),
-    ("updates", ("learner/compiled.py", "learner/learner.py", "learner/updates.py", "learner/double_dqn.py")),
-    ("replay", tuple(f"actors/{name}.py" for name in REPLAY)),
-    ("transitions and blocks", ("actors/rollout.py", "actors/nstep.py", "actors/vector_env.py")),
+    ("policy", ("actors/policy/network.py", "actors/policy/mlp_kernels.py", "actors/rollout/exploration.py")),
+    (
+        "updates",
+        (
+            "learner/update/compiled_updates.py",
+            "learner/update/learner.py",
+            "learner/update/updates.py",
+            "learner/update/double_dqn.py",
+        ),
+    ),
+    ("replay", ("actors/replay/", "actors/service/packing.py", "actors/storage/ring_snapshot.py")),
+    ("transitions and blocks", ("actors/rollout/worker.py", "actors/rollout/nstep.py", "actors/rollout/vector_env.py")),
     ("training loop", ("learner/", "actors/", "tests/")),
     (RAY, ("ray/", "<frozen")),
 )

@@ -19,12 +19,12 @@ from gymnasium.spaces import Box, Discrete
 from rich.console import Console
 from rich.table import Table
 
-from actors.prioritised import PrioritySettings
-from actors.rollout import join_stats
-from actors.shard_node import ShardSettings, make_shard
-from actors.transitions import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
-from learner.double_dqn import importance_weights
-from learner.learner import Columns
+from actors.replay.node import ShardSettings, make_shard
+from actors.replay.prioritised import PrioritySettings
+from actors.rollout.worker import join_stats
+from actors.service.messages import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
+from learner.update.double_dqn import importance_weights
+from learner.update.learner import Columns
 from tests.benchmarks.timing import ratio, spread, stopwatch, timed_rates
 from tests.packed import pack_as_collected
 

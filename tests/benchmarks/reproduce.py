@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 import dashboards
-from actors.estimates import Estimate, as_percent, rate
-from actors.result_table import LEARNED, ResultRow, read_table
-from dashboards.pooled import Cell, Results, Setup
+from actors.evaluation.result_table import LEARNED, ResultRow, read_table
+from actors.evaluation.statistics import Estimate, as_percent, rate
+from dashboards.analysis.aggregate import Cell, Results, Setup
 from deploy.cli import main as shoal
 from learner.presets import PresetName
 from sim_core.outcomes import ENDED, Outcome

@@ -9,12 +9,12 @@ import psutil
 from rich.console import Console
 from rich.table import Table
 
-from actors.packing import frames_of, packed_dtype
-from actors.transitions import transition_dtype
-from actors.vector_env import env_shape
-from learner.cluster import learner_settings
+from actors.rollout.vector_env import env_shape
+from actors.service.messages import transition_dtype
+from actors.service.packing import frames_of, packed_dtype
 from learner.config import RunConfig
-from learner.learner import Learner
+from learner.training.cluster import learner_settings
+from learner.update.learner import Learner
 from tests.benchmarks.hop_costs import measured_costs
 from tests.benchmarks.ray_service import ENDLESS, Point, measured_point
 from tests.benchmarks.service_model import (

@@ -7,13 +7,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from actors.network import snapshot
-from actors.rollout import RolloutWorker
-from actors.transitions import transition_dtype
-from actors.vector_env import env_shape, make_vector_env
-from learner.cluster import learner_settings, rollout_settings
+from actors.policy.network import snapshot
+from actors.rollout.vector_env import env_shape, make_vector_env
+from actors.rollout.worker import RolloutWorker
+from actors.service.messages import transition_dtype
 from learner.config import RunConfig
-from learner.learner import Learner
+from learner.training.cluster import learner_settings, rollout_settings
+from learner.update.learner import Learner
 from sim_core.config import WorldConfig
 from tests.benchmarks.ray_service import ENDLESS, Point, measured_point
 from tests.benchmarks.timing import rates, ratio, spread

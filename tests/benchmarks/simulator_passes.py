@@ -1,6 +1,6 @@
 """Where the time of a step goes: the processor's cycle counter read between the passes of real episodes.
 
-`_timed_advance` is `sim_core.step.advance` with a watch; the calls, and so the work, are the same.
+`_timed_advance` is `sim_core.swarm.step.advance` with a watch; the calls, and so the work, are the same.
 """
 
 import time
@@ -13,13 +13,13 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from rich.table import Table
 
-from sim_core import step
 from sim_core.config import WorldConfig
-from sim_core.flocking import preferred_velocity
 from sim_core.jit import kernel
 from sim_core.lanes import load, scatter
-from sim_core.neighbours import find_neighbours, lists_of
 from sim_core.orca import build_half_planes, orca_velocity
+from sim_core.swarm import step
+from sim_core.swarm.flocking import preferred_velocity
+from sim_core.swarm.neighbours import find_neighbours, lists_of
 from sim_core.worlds import WorldBatch
 
 SETUPS = ((5, 2), (10, 4), (25, 8))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.trajectory import Episode
+from actors.evaluation.trajectory import Episode
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
 from sim_core.worlds import WorldBatch

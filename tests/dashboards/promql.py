@@ -7,7 +7,7 @@ from pathlib import Path
 import promql_parser
 import yaml
 
-from learner.metric_names import METRICS
+from learner.tracking.metric_names import METRICS
 
 ROOT = Path(__file__).parents[2]
 DASHBOARD = ROOT / "dashboards" / "grafana" / "shoal.json"

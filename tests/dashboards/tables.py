@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from actors.result_table import LEARNED, ResultRow
-from dashboards.pooled import GROUPS, ROBOTS, SETUPS, Setup
+from actors.evaluation.result_table import LEARNED, ResultRow
+from dashboards.analysis.aggregate import GROUPS, ROBOTS, SETUPS, Setup
 
 EPISODES = 3000
 SENSOR_SUCCESS = {  # by groups 1, 2, 3, 4, 8

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from actors.result_table import ResultRow
-from dashboards.claims import judge
-from dashboards.pooled import Results, Setup
+from actors.evaluation.result_table import ResultRow
+from dashboards.analysis.aggregate import Results, Setup
+from dashboards.analysis.claims import judge
+from dashboards.figures.result_figures import PICTURES
 from dashboards.report import DRAWINGS, PresetPart, baselines_of, comparison, presets_of, report_markdown
-from dashboards.result_figures import PICTURES
 from tests.dashboards.tables import claimed_table, fixed, row
 
 

@@ -10,11 +10,11 @@ import pytest
 from PIL import Image
 
 import dashboards
-from actors.result_table import LEARNED, read_table
+from actors.evaluation.result_table import LEARNED, read_table
 from deploy.cli import main
-from deploy.sittings import grid_of, read_sittings
+from deploy.runs.sweep_provenance import grid_of, read_sittings
 from learner.config import RunConfig, to_dict
-from learner.sweep import expected_hash, make_cell, sweep_of_label
+from learner.sweep.grid import expected_hash, make_cell, sweep_of_label
 
 ROOT = Path(dashboards.__file__).parent / "results"
 FOLDERS = sorted(path.parent for path in ROOT.glob("*/results.csv"))

@@ -104,4 +104,4 @@ def test_the_copied_files_build_a_wheel_with_every_package(copied, tmp_path):
     kept = [name for name in context() if not name.startswith("deploy/examples/")]  # to read, not to import
     sources = {name for name in kept if name.endswith(".py") or name.startswith("dashboards/web/")}
     assert sources <= names
-    assert {"learner/ray_edge.py", "sim_core/methods/sensor.py", "dashboards/web/player.js"} <= sources
+    assert {"learner/ray_backend/cluster.py", "sim_core/methods/m_sensor.py", "dashboards/web/player.js"} <= sources

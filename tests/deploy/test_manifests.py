@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 from ray.scripts.scripts import start as ray_start
 
 from deploy.cli import parse
-from deploy.options import Sweep
+from deploy.options.training import Sweep
 from tests.deploy.manifests import (
     CRDS,
     RAY_KINDS,

@@ -21,14 +21,14 @@ from typing import Any, NamedTuple, NoReturn
 import pytest
 from hypothesis import strategies as st
 
-import deploy.playing
-import deploy.report
-import deploy.sweep
-import deploy.training
+import deploy.commands.evaluate
+import deploy.commands.report
+import deploy.commands.sweep
+import deploy.commands.train
 from deploy.cli import BAD_INPUT, main
 from learner.config import RunConfig
 from learner.run_folder import RunFolder, RunIdentity
-from learner.sweep import SweepConfig
+from learner.sweep.grid import SweepConfig
 from sim_core.config import WorldConfig
 from tests.integration.conftest import SMALL
 
@@ -84,10 +84,10 @@ def workplace(folder: Path) -> Iterator[None]:
     (folder / "a-file").write_text("of no use")
     (folder / "results.csv").write_text("preset,policy\n")
     ports = {
-        deploy.training: ("execute", "Tracker"),
-        deploy.sweep: ("run_cells", "Tracker"),
-        deploy.playing: ("evaluate_in_tasks", "record_episode", "foreign_animation"),
-        deploy.report: ("_write",),
+        deploy.commands.train: ("execute", "Tracker"),
+        deploy.commands.sweep: ("run_cells", "Tracker"),
+        deploy.commands.evaluate: ("evaluate_in_tasks", "record_episode", "foreign_animation"),
+        deploy.commands.report: ("_write",),
     }
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from actors.parts import file_sum
+from actors.storage.part_writer import file_sum
 from deploy.cli import main, parse
-from learner.manifest import decode_manifest, encode_manifest
+from learner.checkpoints.manifest import decode_manifest, encode_manifest
 from learner.presets import preset_config
 from learner.run_folder import RunFolder
 from tests.integration.conftest import SMALL, flags

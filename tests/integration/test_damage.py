@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from learner.checkpoint import newest_valid
-from learner.cluster import process_cluster
-from learner.journal import Journal
+from learner.checkpoints.checkpoint import newest_valid
 from learner.loop import TrainingLoop
+from learner.tracking.journal import Journal
+from learner.training.cluster import process_cluster
 from tests.checkpointing import Silent
 from tests.integration.conftest import SMALL
 

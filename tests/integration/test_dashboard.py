@@ -14,24 +14,24 @@ from contextlib import closing, contextmanager
 import mlflow
 import numpy as np
 import pytest
+from tests.dashboards.test_web_report import requested
 
-from actors.evaluator import record_episode
-from actors.result_table import read_table, write_table
+from actors.evaluation.evaluator import record_episode
+from actors.evaluation.result_table import read_table, write_table
 from deploy.cli import main
-from deploy.dashboard import report_server
-from deploy.dashboard_source import find_source
+from deploy.commands.dashboard import report_server
 from deploy.live import live_server
-from deploy.policies import find_policy
-from learner.checkpoint import newest_valid
-from learner.cluster import process_cluster
-from learner.journal import Journal, read_rows
+from deploy.report_data.sources import find_source
+from deploy.runs.policy_lookup import find_policy
+from learner.checkpoints.checkpoint import newest_valid
 from learner.loop import TrainingLoop
 from learner.run_folder import RunFolder
-from learner.sweep import SweepConfig, make_cells
-from learner.tracker import Tracker
-from learner.trial import SweepPlace, run_cell
+from learner.sweep.cell import SweepPlace, run_cell
+from learner.sweep.grid import SweepConfig, make_cells
+from learner.tracking.journal import Journal, read_rows
+from learner.tracking.mlflow_run import Tracker
+from learner.training.cluster import process_cluster
 from tests.dashboards.chromium import complaints, open_chromium, wait_until
-from tests.dashboards.test_web_report import requested
 from tests.integration.conftest import SMALL, clean_environment
 from tests.integration.test_process_run import Silent
 

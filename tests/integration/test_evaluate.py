@@ -9,16 +9,16 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
-from actors.baselines import Baseline
-from actors.evaluation_store import load_evaluation
-from actors.evaluator import evaluate
-from actors.network import QNetwork, snapshot
-from actors.trajectory import load_episodes
-from actors.vector_env import EnvSpec, env_shape
-from deploy import playing
+from actors.evaluation.evaluation_store import load_evaluation
+from actors.evaluation.evaluator import evaluate
+from actors.evaluation.trajectory import load_episodes
+from actors.policy.baselines import Baseline
+from actors.policy.network import QNetwork, snapshot
+from actors.rollout.vector_env import EnvSpec, env_shape
 from deploy.cli import main
-from deploy.playing import episodes_path
-from learner.policy_file import save_policy
+from deploy.commands import evaluate as playing
+from deploy.commands.evaluate import episodes_path
+from learner.export.policy_file import save_policy
 from learner.presets import preset_config
 from learner.run_folder import RunFolder
 from sim_core import ENV_ID

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.vector_env import env_shape
+from actors.rollout.vector_env import env_shape
 from deploy.cli import main
-from learner.checkpoint import newest_valid
-from learner.policy_file import read_policy, save_policy
+from learner.checkpoints.checkpoint import newest_valid
+from learner.export.policy_file import read_policy, save_policy
 from learner.run_folder import RunFolder
 from tests.integration.conftest import SMALL, flags
 

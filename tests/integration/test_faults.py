@@ -6,10 +6,10 @@ import re
 import mlflow
 import pytest
 
-from deploy.chaos_checks import complaints
-from deploy.chaos_processes import TrackingServer
-from learner.journal import PushedMark
+from deploy.chaos.checks import complaints
+from deploy.chaos.processes import TrackingServer
 from learner.run_folder import RunFolder
+from learner.tracking.journal import PushedMark
 from tests.integration.conftest import SMALL, flags
 from tests.integration.jobs import Job
 

@@ -10,10 +10,10 @@ pytestmark = pytest.mark.ray
 
 SCRIPT = """
 import atexit, os, time
-from learner.ray_auth import guard_ray
+from learner.ray_backend.auth import guard_ray
 guard_ray(joins=False)
 import ray
-from learner.ray_edge import connect, leave
+from learner.ray_backend.cluster import connect, leave
 
 class Part:
     def pid(self):

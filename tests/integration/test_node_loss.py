@@ -6,12 +6,12 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
-from deploy.chaos_checks import complaints
-from learner.fault_log import read_faults
-from learner.place import Place
+from deploy.chaos.checks import complaints
 from learner.run import execute
 from learner.run_folder import RunFolder, RunIdentity
-from learner.tracker import Tracker
+from learner.tracking.fault_log import read_faults
+from learner.tracking.mlflow_run import Tracker
+from learner.training.cluster import Place
 from tests.integration.conftest import SMALL
 
 pytestmark = [

@@ -7,7 +7,7 @@ import mlflow
 import pytest
 
 from deploy.cli import main
-from learner.checkpoint import newest_valid
+from learner.checkpoints.checkpoint import newest_valid
 from tests.integration.conftest import SMALL, flags
 
 pytestmark = pytest.mark.filterwarnings(

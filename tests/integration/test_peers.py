@@ -7,8 +7,8 @@ import pytest
 import torch
 from stable_baselines3.common.env_util import make_vec_env
 
-from actors.network import Policy, QNetwork
-from actors.vector_env import env_shape, make_vector_env
+from actors.policy.network import Policy, QNetwork
+from actors.rollout.vector_env import env_shape, make_vector_env
 from learner.config import RunConfig
 from tests.benchmarks import contest, entrants, peers
 from tests.benchmarks.contenders.limit import most_updates

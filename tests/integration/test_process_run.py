@@ -11,10 +11,10 @@ import pytest
 import zarr
 from safetensors.numpy import load_file
 
-from learner.checkpoint import newest_valid
-from learner.cluster import process_cluster
-from learner.journal import Journal
+from learner.checkpoints.checkpoint import newest_valid
 from learner.loop import TrainingLoop
+from learner.tracking.journal import Journal
+from learner.training.cluster import process_cluster
 from tests.checkpointing import Silent
 from tests.integration.conftest import flags
 from tests.integration.jobs import Job

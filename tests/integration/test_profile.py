@@ -7,18 +7,22 @@ import pytest
 from tests.benchmarks.profile import RAY, sorted_samples, spent_on, work_of
 
 LOOP = "main_loop (ray/_private/worker.py:1069);executor (ray/_private/function_manager.py:740)"
-COLLECT = f"{LOOP};RolloutNode.collect (actors/rollout_node.py:70);RolloutWorker.collect (actors/rollout.py:85)"
+COLLECT = f"{LOOP};RolloutNode.collect (actors/rollout/node.py:70);RolloutWorker.collect (actors/rollout/worker.py:85)"
 
 
 @pytest.mark.parametrize(
     ("stack", "work"),
     [
         (f"{COLLECT};SwarmVectorEnv.step (sim_core/envs.py:187);WorldBatch.step (sim_core/worlds.py:96)", "simulation"),
-        (f"{COLLECT};Policy.greedy (actors/network.py:148)", "policy"),
+        (f"{COLLECT};Policy.greedy (actors/policy/network.py:148)", "policy"),
         (f"{COLLECT};_any (numpy/_core/_methods.py:61)", "transitions and blocks"),
-        (f"{LOOP};LearnerNode.update (learner/node.py:1);CompiledUpdates._run (learner/compiled.py:108)", "updates"),
-        (f"{LOOP};ShardNode.sample (actors/shard_node.py:1);choice (numpy/random.py:1)", "replay"),
-        (f"{LOOP};RolloutNode._push (actors/rollout_node.py:2);remote (ray/actor.py:945)", RAY),
+        (
+            f"{LOOP};LearnerNode.update (learner/update/learner_node.py:1);"
+            "CompiledUpdates._run (learner/update/compiled_updates.py:108)",
+            "updates",
+        ),
+        (f"{LOOP};ShardNode.sample (actors/replay/node.py:1);choice (numpy/random.py:1)", "replay"),
+        (f"{LOOP};RolloutNode._push (actors/rollout/node.py:2);remote (ray/actor.py:945)", RAY),
         ("TrainingLoop.run (learner/loop.py:112);fmean (statistics.py:1)", "training loop"),
         ("_bootstrap (threading.py:1002);select (selectors.py:468)", RAY),
     ],

@@ -12,9 +12,9 @@ import pytest
 import zarr
 from safetensors.numpy import load_file
 
-from learner.checkpoint import newest_valid
+from learner.checkpoints.checkpoint import newest_valid
 from learner.config import flat_params, to_dict
-from learner.ray_edge import COLLECTS_IN_FLIGHT, PUSHES_IN_FLIGHT
+from learner.ray_backend.cluster import COLLECTS_IN_FLIGHT, PUSHES_IN_FLIGHT
 from tests.integration.conftest import SMALL, flags
 from tests.integration.jobs import Job
 

@@ -17,8 +17,8 @@ import promql_parser
 import pytest
 import yaml
 
-from learner.checkpoint import newest_valid
-from learner.metric_names import ENV_STEPS, METRICS
+from learner.checkpoints.checkpoint import newest_valid
+from learner.tracking.metric_names import ENV_STEPS, METRICS
 from tests.dashboards.promql import alert_queries, dashboard, dashboard_queries
 from tests.deploy.manifests import PROMETHEUS
 from tests.deploy.project import free_port

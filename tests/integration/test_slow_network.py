@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from deploy.chaos_checks import complaints
-from learner.checkpoint import finished_names
-from learner.checkpoint_store import env_steps_of
-from learner.fault_log import read_faults
+from deploy.chaos.checks import complaints
+from learner.checkpoints.checkpoint import finished_names
+from learner.checkpoints.store import env_steps_of
 from learner.run_folder import RunFolder
+from learner.tracking.fault_log import read_faults
 from tests.integration.conftest import SMALL, clean_environment, flags
 from tests.integration.jobs import wait_for
 from tests.integration.machines import SlowCable, at, machines

@@ -11,7 +11,7 @@ from pathlib import Path
 import mlflow
 import pytest
 
-from learner.checkpoint import newest_valid
+from learner.checkpoints.checkpoint import newest_valid
 from tests.integration.conftest import SMALL, clean_environment
 from tests.integration.jobs import wait_for
 from tests.integration.ray_head import NO_TOKEN, Head, copy_of_the_code, finish, running_head, submit

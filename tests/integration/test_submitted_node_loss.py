@@ -6,9 +6,9 @@ import re
 
 import pytest
 
-from deploy.chaos_checks import complaints
-from learner.fault_log import read_faults
+from deploy.chaos.checks import complaints
 from learner.run_folder import RunFolder
+from learner.tracking.fault_log import read_faults
 from tests.integration.conftest import SMALL
 from tests.integration.jobs import wait_for
 from tests.integration.ray_head import copy_of_the_code, finish, joined_node, kill, running_head, submit

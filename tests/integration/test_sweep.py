@@ -5,12 +5,12 @@ import fcntl
 import mlflow
 import pytest
 
-from actors.result_table import read_table, write_table
+from actors.evaluation.result_table import read_table, write_table
 from deploy.cli import main
-from learner.sweep import SweepConfig, make_cells
-from learner.tracker import Tracker
-from learner.trial import SweepPlace, run_cell
-from learner.tune_edge import run_cells
+from learner.sweep.cell import SweepPlace, run_cell
+from learner.sweep.grid import SweepConfig, make_cells
+from learner.sweep.tune import run_cells
+from learner.tracking.mlflow_run import Tracker
 from tests.integration.jobs import Job
 
 pytestmark = [
@@ -133,7 +133,7 @@ def test_what_cannot_be_is_refused_before_anything_runs(capsys, tmp_path, monkey
 
 
 class Told:
-    """Remembers what it is told; implements `learner.tune_edge.CellListener`."""
+    """Remembers what it is told; implements `learner.sweep.tune.CellListener`."""
 
     def __init__(self):
         self.events = []

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from actors.transitions import transition_dtype
+from actors.service.messages import transition_dtype
 from learner.config import RunConfig
-from learner.updates import LearnerSettings
+from learner.update.updates import LearnerSettings
 from sim_core.config import WorldConfig
 
 ROW = transition_dtype(gym.spaces.Box(-100, 100, (3,), np.float32))

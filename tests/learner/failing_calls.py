@@ -5,8 +5,8 @@ from collections import defaultdict, deque
 
 import numpy as np
 
-from actors.calls import Done, LocalCalls
-from actors.faults import CallFailed, Fault
+from actors.service.fault_policy import CallFailed, Fault
+from actors.service.rpc import Done, LocalCalls
 
 
 class Later:

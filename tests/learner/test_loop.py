@@ -6,10 +6,10 @@ from contextlib import closing
 
 import pytest
 
-from actors.rollout_node import RolloutNode
-from learner.cluster import process_cluster, rollout_settings
-from learner.journal import Journal
+from actors.rollout.node import RolloutNode
 from learner.loop import TrainingLoop
+from learner.tracking.journal import Journal
+from learner.training.cluster import process_cluster, rollout_settings
 from tests.checkpointing import Silent
 from tests.learner.failing_calls import FailingCalls
 

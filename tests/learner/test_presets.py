@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from actors.result_table import GROUPS, ROBOTS
+from actors.evaluation.result_table import GROUPS, ROBOTS
 from learner.presets import preset_config
 
 

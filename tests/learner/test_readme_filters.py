@@ -7,7 +7,7 @@ import mlflow
 import pytest
 
 from learner.config import RunConfig
-from learner.tracker import Tracker
+from learner.tracking.mlflow_run import Tracker
 from sim_core.config import WorldConfig
 
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy is deprecated")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim_core.state import empty_state
-from sim_core.step import swarm_params
+from sim_core.swarm.step import swarm_params
 from tests.sim_core.kernels import flock_of
 
 REAL = np.float32

@@ -8,14 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim_core.flocking import finish_separation, look, preferred_velocity, weighted_sum
-from sim_core.grid import CELLS_PER_RANGE, arrange
 from sim_core.jit import kernel
 from sim_core.lanes import LANES, gather, load, scatter, splat, store
-from sim_core.neighbours import find_neighbours, neighbour_params
 from sim_core.orca import build_half_planes, linear_program_2, linear_program_3, orca_params, orca_velocity
-from sim_core.step import find_flock_terms
-from sim_core.tile import empty_tile
+from sim_core.swarm.flocking import finish_separation, look, preferred_velocity, weighted_sum
+from sim_core.swarm.grid import CELLS_PER_RANGE, arrange
+from sim_core.swarm.neighbours import find_neighbours, neighbour_params
+from sim_core.swarm.step import find_flock_terms
+from sim_core.swarm.tile import empty_tile
 
 
 class OrcaStep(NamedTuple):

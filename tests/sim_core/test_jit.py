@@ -23,7 +23,7 @@ import numba
 before = numba.config.CACHE_DIR
 import numpy as np
 from sim_core.config import WorldConfig
-from sim_core.scenario import scenario_params, start_world
+from sim_core.swarm.scenario import scenario_params, start_world
 
 pos, vel, goals = np.zeros((2, 1, 20)), np.zeros((2, 1, 20)), np.zeros((2, 1, 2))
 learner, stream = np.zeros(1, np.int32), np.ones(1, np.uint64)
@@ -74,7 +74,11 @@ def test_kernels_follow_changes_of_the_neighbours_that_have_kernels(tmp_path):
     for package in ("sim_core", *jit.NEIGHBOURS):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
     start(tmp_path)
-    for name, follows in (("actors/perceptron.py", True), ("learner/compiled.py", True), ("actors/calls.py", False)):
+    for name, follows in (
+        ("actors/policy/mlp_kernels.py", True),
+        ("learner/update/compiled_updates.py", True),
+        ("actors/service/rpc.py", False),
+    ):
         before = len(list((tmp_path / "cache").iterdir()))
         with (tmp_path / name).open("a") as source:
             source.write("# changed\n")

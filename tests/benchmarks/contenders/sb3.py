@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
-from actors.vector_env import final_observations, make_vector_env, reset_seeded
+from actors.rollout.vector_env import final_observations, make_vector_env, reset_seeded
 from tests.benchmarks.contest import Finding, Heat, Lap, compete, policy_of, rhythm, target_every_env_steps
 
 

@@ -1,0 +1,1 @@
+"""Greedy episodes, their statistics, and how they are stored."""

@@ -1,0 +1,91 @@
+"""One evaluation in zarr: what played, in which world, and how each episode ended; never read back damaged."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import zlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from actors.rollout.vector_env import EnvSpec
+from actors.service.messages import EpisodeStats
+from actors.storage.zarr_columns import load_rows, open_store, save_rows
+from sim_core.checks import ConfigError, require
+from sim_core.config import WorldConfig
+
+FORMAT = "shoal-evaluation-1"
+EPISODE = np.dtype(
+    [("seed", np.int64), ("outcome", np.int8), ("length_steps", np.int32), ("episode_return", np.float64)]
+)
+
+
+class StoredEvaluation(NamedTuple):
+    """An evaluation as it is stored.
+
+    `spec` is where it was played; `player` a run's name or a baseline's; `updates` the number of updates behind the
+    policy, 0 for a baseline; `seed` `[episodes]` int64 the episodes' seeds, in the order of `stats`.
+    """
+
+    spec: EnvSpec
+    player: str
+    updates: int
+    seed: NDArray[np.int64]
+    stats: EpisodeStats
+
+
+def refuse_existing(path: Path) -> None:
+    """Raises ConfigError where something is at `path`: results are not overwritten."""
+    require(not path.exists(), f"{path} exists and is not overwritten; name another file or remove it")
+
+
+def save_evaluation(path: Path, evaluation: StoredEvaluation) -> None:
+    """Writes a new zarr group at `path`, which appears once it is whole.
+
+    Raises:
+      ConfigError: something is at `path`.
+    """
+    refuse_existing(path)
+    rows = np.zeros(len(evaluation.seed), EPISODE)
+    rows["seed"] = evaluation.seed
+    for name, column in evaluation.stats._asdict().items():
+        rows[name] = column
+    part = path.with_name(path.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    save_rows(part, rows, FORMAT)
+    header: dict[str, Any] = {
+        "env_id": evaluation.spec.env_id,
+        "world": dataclasses.asdict(evaluation.spec.world),
+        "player": evaluation.player,
+        "updates": evaluation.updates,
+    }
+    zarr.open_group(str(part), mode="r+").attrs.update({"header": header, "header_crc32": _crc32(header)})
+    part.rename(path)
+
+
+def load_evaluation(path: Path) -> StoredEvaluation:
+    """Reads what `save_evaluation` wrote.
+
+    Raises:
+      ValueError: the group is missing, damaged, or something else.
+    """
+    rows = load_rows(path, EPISODE, FORMAT)
+    attributes: Any = open_store(path).attrs.asdict()
+    header = attributes.get("header")
+    if header is None or _crc32(header) != attributes.get("header_crc32"):
+        raise ValueError(f"the header of {path} is damaged (checksum); evaluate again")
+    try:
+        spec = EnvSpec(header["env_id"], WorldConfig(**header["world"]))
+    except (TypeError, ConfigError) as error:
+        raise ValueError(f"{path} has settings of another version of shoal ({error}); evaluate again") from error
+    stats = EpisodeStats(*(rows[name] for name in EpisodeStats._fields))
+    return StoredEvaluation(spec, header["player"], header["updates"], rows["seed"], stats)
+
+
+def _crc32(header: dict[str, Any]) -> int:
+    return zlib.crc32(json.dumps(header, sort_keys=True).encode())

@@ -1,0 +1,247 @@
+"""Evaluation on fixed seeds: one episode a seed, so that short episodes are not over-counted.
+
+Learned policies, which act greedily, and baselines are played by the same loop.
+"""
+
+from __future__ import annotations
+
+from itertools import count, pairwise
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.evaluation.trajectory import NO_ACTION, Episode
+from actors.policy.baselines import Baseline, Player, make_baseline
+from actors.policy.network import Policy, WeightsSnapshot
+from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
+from actors.rollout.worker import join_stats
+from actors.service.fault_policy import Action, CallFailed, PartKind, decide
+from actors.service.messages import NO_OUTCOME, EpisodeStats
+from actors.service.rpc import Calls, Ref
+from sim_core.checks import require
+from sim_core.config import WorldConfig
+from sim_core.outcomes import Outcome
+from sim_core.worlds import WorldBatch, is_done
+
+MAX_ENVS = 250
+"""Environments stepped at once."""
+
+Candidate = WeightsSnapshot | Baseline
+"""What is evaluated, as data that travels to where it plays: a learned policy's weights, or a baseline's name."""
+
+
+class GreedyPolicy:
+    """A learned policy that takes the action of the highest value; implements `actors.policy.baselines.Player`.
+
+    Args:
+      weights: the snapshot to act with.
+    """
+
+    def __init__(self, weights: WeightsSnapshot) -> None:
+        self._policy = Policy(weights)
+
+    def act(self, observation: NDArray[Any]) -> NDArray[np.int64]:
+        """Best actions `[batch]`; the lowest index among equals."""
+        return self._policy.greedy(observation)
+
+
+def make_player(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> Player:
+    """What chooses the candidate's actions in one episode a seed, all played at once.
+
+    Raises:
+      ConfigError: a baseline is to play in an environment that is not ours.
+    """
+    if isinstance(candidate, WeightsSnapshot):
+        return GreedyPolicy(candidate)
+    require(spec.is_swarm, f"the baseline {candidate} plays in our own environment only, not in {spec.env_id}")
+    return make_baseline(candidate, spec.world, seeds)
+
+
+def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> EpisodeStats:
+    """Plays one episode from each seed.
+
+    Returns:
+      One entry a seed, in order.
+
+    Raises:
+      ConfigError: see `make_player`.
+    """
+    chunks = [seeds[i : i + MAX_ENVS] for i in range(0, len(seeds), MAX_ENVS)]
+    return join_stats([_play(spec, make_player(spec, candidate, chunk), chunk) for chunk in chunks])
+
+
+def evaluate_in_parts(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: list[int], parts: int) -> EpisodeStats:
+    """`evaluate` as up to `parts` calls at once; `candidate` refers to a Candidate.
+
+    Returns:
+      One entry a seed, in order.
+
+    Raises:
+      CallFailed: one of the calls fails again and again.
+    """
+    parts = min(parts, len(seeds))
+    bounds = [len(seeds) * i // parts for i in range(parts + 1)] if parts else []
+    chunks = [seeds[begin:end] for begin, end in pairwise(bounds)]
+    refs = [calls.run(evaluate, spec, candidate, chunk) for chunk in chunks]
+    return join_stats([_played(calls, spec, candidate, *call) for call in zip(chunks, refs, strict=True)])
+
+
+def _played(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: list[int], ref: Ref) -> EpisodeStats:
+    """What a call of `evaluate` gave; it is made again as long as the decision table says so."""
+    for attempt in count(1):
+        try:
+            stats: EpisodeStats = calls.get(ref)
+            return stats
+        except CallFailed as failure:
+            if decide(PartKind.EVALUATOR, failure.fault, attempt, 0.0) is Action.STOP:
+                raise
+            ref = calls.run(evaluate, spec, candidate, seeds)
+    raise AssertionError("count never ends")
+
+
+class _Step(NamedTuple):
+    """What a step of every episode gave `[batch, ...]`; `outcome` is of those that ended."""
+
+    observation: NDArray[Any]
+    reward: NDArray[np.float64]
+    ended: NDArray[np.bool_]
+    outcome: NDArray[np.int8]
+
+
+class _Worlds:
+    """Our own worlds, which FL-ORCA may drive; once half of them have ended, those that run go on alone."""
+
+    def __init__(self, config: WorldConfig, seeds: list[int]) -> None:
+        self._worlds = WorldBatch(config, len(seeds))
+        self._worlds.seed(seeds)
+        self._episode = np.arange(len(seeds))  # of every world that is still stepped
+        self._over = np.zeros(len(seeds), np.bool_)  # those that have ended among them
+        self._last = _Step(
+            observation=self._worlds.reset(),
+            reward=np.zeros(len(seeds)),
+            ended=np.zeros(len(seeds), np.bool_),
+            outcome=np.zeros(len(seeds), np.int8),
+        )
+
+    def start(self) -> NDArray[Any]:
+        return self._last.observation
+
+    def step(self, action: NDArray[np.int64] | None) -> _Step:
+        result = self._worlds.step(None if action is None else action[self._episode])
+        done = is_done(result.outcome)
+        last, episode = self._last, self._episode
+        last.observation[episode] = result.observation
+        last.reward[episode] = result.reward
+        last.ended[episode] = done
+        last.outcome[episode] = result.outcome
+        self._over |= done
+        if self._over.mean() >= 0.5 and not self._over.all():
+            self._leave_ended()
+        return self._last
+
+    def _leave_ended(self) -> None:
+        running = ~self._over
+        state = {name: array[running] for name, array in self._worlds.get_state().items()}
+        self._episode = self._episode[running]
+        self._over = self._over[running]
+        self._worlds = WorldBatch(self._worlds.config, len(self._episode))
+        self._worlds.set_state(state)
+
+    def close(self) -> None:
+        pass
+
+
+class _Environments:
+    """Environments of any Gymnasium id; ended ones restart, and their next episodes count for nothing."""
+
+    def __init__(self, spec: EnvSpec, seeds: list[int]) -> None:
+        self._env = make_vector_env(spec, len(seeds))
+        self._seeds = seeds
+
+    def start(self) -> NDArray[Any]:
+        return reset_seeded(self._env, self._seeds)
+
+    def step(self, action: NDArray[np.int64] | None) -> _Step:
+        observation, reward, terminated, truncated, infos = self._env.step(action)
+        outcome = infos.get("final_info", {}).get("outcome")
+        if outcome is None:
+            outcome = np.full(len(self._seeds), NO_OUTCOME, np.int8)
+        return _Step(observation, reward, terminated | truncated, outcome)
+
+    def close(self) -> None:
+        self._env.close()
+
+
+def _play(spec: EnvSpec, player: Player, seeds: list[int]) -> EpisodeStats:
+    count = len(seeds)
+    stats = EpisodeStats(np.full(count, NO_OUTCOME, np.int8), np.zeros(count, np.int32), np.zeros(count))
+    stage = _Worlds(spec.world, seeds) if spec.is_swarm else _Environments(spec, seeds)
+    observation = stage.start()
+    running = np.ones(count, np.bool_)
+    while running.any():
+        observation, reward, done, outcome = stage.step(player.act(observation))
+        stats.length_steps[running] += 1
+        stats.episode_return[running] += reward[running]
+        ended = running & done
+        stats.outcome[ended] = outcome[ended]
+        running &= ~ended
+    stage.close()
+    return stats
+
+
+def record_episode(spec: EnvSpec, candidate: Candidate, seed: int) -> Episode:
+    """Plays one episode of our own environment and keeps every state."""
+    worlds = WorldBatch(spec.world, 1)
+    player = make_player(spec, candidate, [seed])
+    worlds.seed([seed])
+    observation = worlds.reset()
+    states, actions, rewards = [_state_of(worlds)], list[int](), list[float]()
+    outcome = Outcome.RUNNING
+    while outcome == Outcome.RUNNING:
+        action = player.act(observation)
+        result = worlds.step(action)
+        observation, outcome = result.observation, Outcome(result.outcome[0])
+        states.append(_state_of(worlds))
+        actions.append(NO_ACTION if action is None else int(action[0]))
+        rewards.append(float(result.reward[0]))
+    position, velocity, machine = (np.stack(column) for column in zip(*states, strict=True))
+    return Episode(
+        position=position,
+        velocity=velocity,
+        machine=machine,
+        action=np.array([*actions, NO_ACTION], np.int64),
+        reward=np.array([*rewards, 0.0], np.float32),
+        goal=worlds.goals()[0],
+        learner=int(worlds.state.learner[0]),
+        outcome=int(outcome),
+        seed=seed,
+    )
+
+
+def record_frames(spec: EnvSpec, weights: WeightsSnapshot, seed: int) -> tuple[list[NDArray[np.uint8]], float]:
+    """Plays one greedy episode of any Gymnasium environment and keeps its images.
+
+    Returns:
+      (images `[height, width, 3]`, images per second); no images where the environment has no rgb_array mode.
+    """
+    policy = Policy(weights)
+    try:
+        env = gym.make(spec.env_id, render_mode="rgb_array")
+    except (TypeError, gym.error.Error):
+        return [], 0.0
+    frames_per_s = float(env.metadata.get("render_fps", 30))
+    observation, _ = env.reset(seed=seed)
+    frames, ended = list[NDArray[np.uint8]](), False
+    while not ended:
+        frames.append(np.asarray(env.render(), np.uint8))
+        observation, _, terminated, truncated, _ = env.step(policy.greedy(observation[None])[0])
+        ended = terminated or truncated
+    env.close()
+    return frames, frames_per_s
+
+
+def _state_of(worlds: WorldBatch) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    velocity = np.stack([worlds.state.vel_x[0], worlds.state.vel_y[0]], axis=-1)
+    return worlds.positions()[0], velocity, worlds.state.machine[0].copy()

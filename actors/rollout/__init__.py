@@ -1,0 +1,1 @@
+"""Stepping environments, exploring, and building n-step transitions."""

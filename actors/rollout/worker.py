@@ -1,0 +1,167 @@
+"""The rollout worker: steps many environments with one policy and packs what it sees into blocks."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.policy.network import Policy, WeightsSnapshot
+from actors.rollout.exploration import draw_detours, explore
+from actors.rollout.nstep import NStepAssembler, Steps, empty_steps
+from actors.rollout.vector_env import EnvSpec, final_observations, make_vector_env, reset_seeded, spaces_of
+from actors.service.messages import (
+    NO_OUTCOME,
+    SCHEMA_VERSION,
+    BlockHeader,
+    EpisodeStats,
+    TransitionBlock,
+    transition_dtype,
+)
+from actors.service.packing import packed_dtype
+from sim_core.envs import SwarmVectorEnv
+
+
+class RolloutSettings(NamedTuple):
+    """What a rollout worker needs to know of the run."""
+
+    env: EnvSpec
+    num_envs: int
+    steps_per_block: int
+    n_step: int
+    discount: float
+    seed: int
+
+
+class RolloutWorker:
+    """Steps `num_envs` environments; one `collect` is one block of `num_envs * steps_per_block` env steps.
+
+    Args:
+      settings: see RolloutSettings.
+      worker_id: position among the workers.
+      incarnation: how often this worker was started before; every start has its own random streams.
+    """
+
+    def __init__(self, settings: RolloutSettings, worker_id: int, incarnation: int) -> None:
+        self._settings = settings
+        self._worker_id = worker_id
+        self._incarnation = incarnation
+        self._sequence = 0
+        self._made = 0
+        self._env = make_vector_env(settings.env, settings.num_envs)
+        shape = spaces_of(self._env)
+        self._num_actions = shape.num_actions
+        self._dtype = packed_dtype(transition_dtype(shape.observation_space))
+        seeds = np.random.SeedSequence((settings.seed, worker_id, incarnation))
+        env_seeds, policy_seed = seeds.spawn(2)
+        self._rng = np.random.Generator(np.random.PCG64(policy_seed))
+        self._nstep = NStepAssembler(self._dtype, settings.num_envs, settings.n_step, settings.discount)
+        self._length = np.zeros(settings.num_envs, np.int32)
+        self._return = np.zeros(settings.num_envs, np.float64)
+        words = env_seeds.generate_state(settings.num_envs) // 2  # Gymnasium takes 31 bits
+        self._observation = reset_seeded(self._env, [int(word) for word in words])
+        self._policy: Policy | None = None
+
+    @property
+    def policy_version(self) -> int:
+        """Version of the weights in use; -1 before there are any."""
+        return -1 if self._policy is None else self._policy.weights.version
+
+    def set_weights(self, weights: WeightsSnapshot) -> None:
+        """Acts with these weights from the next env step on."""
+        self._policy = Policy(weights)
+
+    def collect(self, rate: float) -> TransitionBlock:
+        """Steps every environment `steps_per_block` times with exploration rate `rate`.
+
+        Raises:
+          RuntimeError: no weights were set.
+        """
+        if self._policy is None:
+            raise RuntimeError("a rollout worker needs weights before it collects")
+        count = self._settings.steps_per_block
+        steps = empty_steps(count, self._settings.num_envs, self._dtype)
+        detours = draw_detours((count, self._settings.num_envs), rate, self._num_actions, self._rng)
+        shape = steps.done.shape
+        ended = EpisodeStats(np.zeros(shape, np.int8), np.zeros(shape, np.int32), np.zeros(shape))
+        for i in range(count):
+            self._step(self._policy, detours[i], steps, ended, i)
+        packed = self._nstep.push(steps)
+        self._made += len(packed.rows)
+        weights = self._policy.weights
+        header = BlockHeader(
+            schema_version=SCHEMA_VERSION,
+            worker_id=self._worker_id,
+            incarnation=self._incarnation,
+            sequence=self._sequence,
+            policy_version=weights.version,
+            policy_time_s=weights.time_s,
+            epsilon=rate,
+            env_steps=count * self._settings.num_envs,
+            made=self._made,
+        )
+        self._sequence += 1
+        return TransitionBlock(header, packed, _of_those(steps.done, ended))
+
+    def _step(self, policy: Policy, detours: NDArray[np.int64], steps: Steps, ended: EpisodeStats, i: int) -> None:
+        """One step of every environment, written as step i of `steps`; what it ended, as step i of `ended`."""
+        action = explore(policy.greedy(self._observation), detours)
+        observation, reward, terminated, truncated, infos = self._env.step(action)
+        done = terminated | truncated
+        steps.observation[i], steps.action[i], steps.reward[i] = self._observation, action, reward
+        steps.reached[i] = final_observations(observation, done, infos)
+        steps.terminated[i], steps.done[i] = terminated, done
+        self._observation = observation
+        self._length += 1
+        self._return += reward
+        if done.any():
+            ended.outcome[i] = infos.get("final_info", {}).get("outcome", NO_OUTCOME)
+            ended.length_steps[i], ended.episode_return[i] = self._length, self._return
+            self._length[done] = 0
+            self._return[done] = 0.0
+
+    def get_state(self) -> dict[str, Any]:
+        """All that a checkpoint needs: `arrays` by name and `meta` for JSON.
+
+        Only our own environments can save their worlds; others start new episodes on resume.
+        """
+        arrays = {f"nstep_{name}": array for name, array in self._nstep.get_state().items()}
+        arrays |= {"length": self._length.copy(), "return": self._return.copy()}
+        if isinstance(self._env, SwarmVectorEnv):
+            arrays |= {f"world_{name}": array for name, array in self._env.worlds.get_state().items()}
+        meta = {"sequence": self._sequence, "rng": self._rng.bit_generator.state, "policy": None}
+        if self._policy is not None:
+            version, time_s, layers = self._policy.weights
+            arrays |= {f"policy_{i}": array for i, array in enumerate(layers)}
+            meta["policy"] = [version, time_s]
+        return {"arrays": arrays, "meta": meta}
+
+    def set_state(self, arrays: dict[str, NDArray[Any]], meta: dict[str, Any]) -> None:
+        """Takes up what `get_state` gave, under the incarnation of this start."""
+        self._sequence = meta["sequence"]
+        self._rng.bit_generator.state = meta["rng"]
+        if meta["policy"] is not None:
+            count = sum(name.startswith("policy_") for name in arrays)
+            version, time_s = meta["policy"]
+            layers = tuple(arrays[f"policy_{i}"] for i in range(count))
+            self.set_weights(WeightsSnapshot(version, time_s, layers))
+        if not isinstance(self._env, SwarmVectorEnv):
+            return
+        worlds = {name[6:]: array for name, array in arrays.items() if name.startswith("world_")}
+        self._observation = self._env.worlds.set_state(worlds)
+        self._nstep.set_state({name[6:]: array for name, array in arrays.items() if name.startswith("nstep_")})
+        self._length[:], self._return[:] = arrays["length"], arrays["return"]
+
+
+def join_stats(parts: list[EpisodeStats]) -> EpisodeStats:
+    """One EpisodeStats of several, in order."""
+    if not parts:
+        return EpisodeStats(np.zeros(0, np.int8), np.zeros(0, np.int32), np.zeros(0, np.float64))
+    columns = zip(*parts, strict=True)
+    return EpisodeStats(*(np.concatenate(column) for column in columns))
+
+
+def _of_those(which: NDArray[np.bool_], stats: EpisodeStats) -> EpisodeStats:
+    outcome, length_steps, episode_return = stats
+    return EpisodeStats(outcome[which], length_steps[which], episode_return[which])

@@ -1,0 +1,1 @@
+"""Files: local or remote locations, zarr columns, durable writes."""

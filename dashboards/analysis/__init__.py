@@ -1,0 +1,1 @@
+"""Pooling of results over seeds, and the checks of the claims."""

@@ -1,0 +1,78 @@
+"""Episodes as MP4 films."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.evaluation.trajectory import Episode
+from sim_core.config import WorldConfig
+from sim_core.render import draw_world
+
+CRF = "20"
+"""x264's constant quality: 18 looks lossless, 23 is its default, larger is smaller and worse."""
+
+
+def episode_frames(episode: Episode, config: WorldConfig, size_px: int = 480) -> Iterator[NDArray[np.uint8]]:
+    """The T + 1 states of `episode`, each drawn as `[size_px, size_px, 3]` uint8 RGB."""
+    for position in episode.position:
+        yield draw_world(position, episode.goal, episode.learner, config, size_px)
+
+
+def write_mp4(frames: Iterable[NDArray[np.uint8]], path: Path, frames_per_s: float) -> None:
+    """Writes an H.264 film that every browser plays (yuv420p); `path` appears once the film is whole.
+
+    Args:
+      frames: `[height, width, 3]` uint8 RGB, all of one shape; an odd edge is made even by repeating its last line.
+      path: ends in `.mp4`; an older file there is replaced.
+      frames_per_s: for simulated time, 1 / time_step_s.
+
+    Raises:
+      ValueError: there are no frames, they differ in shape or are not uint8, or `path` does not end in `.mp4`.
+    """
+    if path.suffix != ".mp4":
+        raise ValueError(f"{path} must end in .mp4")
+    part = path.with_name(f"{path.stem}.part.mp4")
+    try:
+        _encode(frames, part, frames_per_s)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _encode(frames: Iterable[NDArray[np.uint8]], path: Path, frames_per_s: float) -> None:
+    """Writes the film at once to `path`, where a broken one stays if `frames` raises."""
+    source = iter(frames)
+    first = next(source, None)
+    if first is None:
+        raise ValueError(f"no frames to write to {path}")
+    height, width = _even(first).shape[:2]
+    encoder = imageio_ffmpeg.write_frames(
+        str(path),
+        (width, height),
+        fps=frames_per_s,
+        codec="libx264",
+        quality=None,
+        pix_fmt_out="yuv420p",
+        macro_block_size=1,
+        output_params=["-crf", CRF, "-movflags", "+faststart"],
+    )
+    with contextlib.closing(encoder):
+        encoder.send(None)
+        for frame in itertools.chain([first], source):
+            if frame.shape != first.shape or frame.dtype != np.uint8:
+                raise ValueError(f"frames must all be {first.shape} uint8; one is {frame.shape} {frame.dtype}")
+            encoder.send(np.ascontiguousarray(_even(frame)))
+
+
+def _even(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = frame.shape[:2]
+    if height % 2 == 0 and width % 2 == 0:
+        return frame
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

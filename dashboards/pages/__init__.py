@@ -1,0 +1,1 @@
+"""Web pages: the report, the episode player, the local server."""

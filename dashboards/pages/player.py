@@ -1,0 +1,147 @@
+"""One episode as one HTML file: a canvas player that needs no network and no framework.
+
+The file works from disk and inside an iframe. Positions travel as steps between states, in units of half a millimetre
+or more, packed; a velocity is the step between two positions, so none is stored.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.evaluation.trajectory import Episode
+from dashboards.pages.assets import OFFLINE, PLAYER_CSS, PLAYER_JS, assets, embedded, fill, packed
+from sim_core.config import WorldConfig
+from sim_core.outcomes import OUTCOME_NAMES, Outcome
+from sim_core.render import GOAL_HALF_SIDE_M, GROUP_COLOURS, view_half_m
+from sim_core.swarm.flock_rules import STATE_NAMES
+
+INT16_MAX = 32767
+SMALLEST_UNIT_M = 0.0005
+"""Positions are no finer than this: a velocity is then exact to 0.01 m/s at a time step of 0.05 s."""
+VERDICTS = {
+    Outcome.RUNNING: "Cut: the recording stops before the episode ended",
+    Outcome.GOAL: "Success: the group reached its goal",
+    Outcome.LOST: "Failure, lost: no robot of its own group within R2",
+    Outcome.CAPTURED: "Failure, captured: only robots of other groups within R2",
+    Outcome.COLLISION: "Failure, collision: it touched another robot",
+    Outcome.TIMEOUT: "Failure, timeout: the group did not reach its goal in time",
+}
+"""What an outcome means for the learning robot, in words."""
+
+
+def player_html(episode: Episode, config: WorldConfig, title: str) -> str:
+    """The player of `episode`.
+
+    Args:
+      episode: T + 1 recorded states.
+      config: the setup it was recorded in.
+      title: plain text; it is escaped.
+
+    Returns:
+      A whole HTML document.
+
+    Raises:
+      ValueError: the positions are not finite, or are not of `config.num_robots` robots.
+    """
+    return player_page(title, player_data(episode, config), "player_page.js", OFFLINE)
+
+
+def player_page(title: str, data: dict[str, Any], script: str, policy: str) -> str:
+    """A document with the player and one more script of `dashboards/web` that says what is played.
+
+    Args:
+      title: plain text; it is escaped.
+      data: what the script finds in the element `data`.
+      script: the file's name.
+      policy: content security policy.
+    """
+    fields = {
+        "title": html.escape(title),
+        "policy": html.escape(policy),
+        "css": assets(*PLAYER_CSS),
+        "stage": assets("stage.html"),
+        "js": assets(*PLAYER_JS, script),
+        "data": embedded(data),
+    }
+    return fill("player.html", fields)
+
+
+def player_data(episode: Episode, config: WorldConfig) -> dict[str, Any]:
+    """What the player draws, ready for JSON.
+
+    `positions` holds differences from state to state `[T + 1, num_robots, 2]` (the first from 0), int16 modulo 2^16 in
+    units of `metres_per_unit`, as two planes of bytes, the low ones first; `machine` `[T + 1, num_robots]` uint8
+    (sim_core.swarm.flock_rules.STATE_NAMES) and `actions` `[T + 1]` int8; all three packed (web_assets.packed).
+
+    Raises:
+      ValueError: the positions are not finite, or are not of `config.num_robots` robots.
+    """
+    position = np.asarray(episode.position, np.float64)
+    if position.ndim != 3 or position.shape[1:] != (config.num_robots, 2) or not np.isfinite(position).all():
+        raise ValueError(
+            f"an episode of {config.setup} has finite positions [T + 1, {config.num_robots}, 2]; "
+            f"these are {position.shape}, finite: {bool(np.isfinite(position).all())}"
+        )
+    outcome, steps = Outcome(episode.outcome), len(position) - 1
+    metres_per_unit = max(float(np.abs(position).max()) / INT16_MAX, SMALLEST_UNIT_M)
+    return {
+        "setup": f"{config.setup}, seed {episode.seed}",
+        "verdict": f"{VERDICTS[outcome]} (step {steps}, {steps * config.time_step_s:.2f} s).",
+        "positions": packed(_byte_planes(np.rint(position / metres_per_unit).astype(np.int16))),
+        "metres_per_unit": metres_per_unit,
+        "machine": packed(episode.machine.astype(np.uint8).tobytes()),
+        "actions": packed(episode.action.astype(np.int8).tobytes()),
+        "piloted": bool((episode.action[:-1] >= 0).any()),
+        "goals": [[round(float(x), 4), round(float(y), 4)] for x, y in episode.goal],
+        "learner": episode.learner,
+        "steps": steps,
+        "outcome": OUTCOME_NAMES[outcome],
+        **_scene(config),
+    }
+
+
+def _scene(config: WorldConfig) -> dict[str, Any]:
+    """What the player knows of a setup."""
+    scale = math.sqrt(config.ellipse_chi_square)
+    ellipse = {
+        "full": config.ellipse_covariance == "full",
+        "axis_scale": scale if config.ellipse_axes == "confidence" else scale / 2,
+        "smallest_m": config.ellipse_smallest_half_axis_m,
+        "counts_learner": config.ellipse_counts_learner,
+    }
+    return {
+        "method": config.method,
+        "robots_per_group": config.robots,
+        "groups": config.groups,
+        "sectors": config.sectors,
+        "sectors_face_goal": config.sector_frame == "goal",
+        "time_step_s": config.time_step_s,
+        "view_half_m": view_half_m(config),
+        "arena_radius_m": config.arena_radius_m,
+        "robot_radius_m": config.robot_radius_m,
+        "goal_half_m": GOAL_HALF_SIDE_M,
+        "inner_radius_m": config.inner_radius_m,
+        "outer_radius_m": config.outer_radius_m,
+        "ellipse": None if config.method == "sensor" else ellipse,
+        "orca": {
+            "radius_m": config.orca_radius_m,
+            "horizon_s": config.orca_horizon_s,
+            "max_neighbours": config.max_neighbours,
+            "range_m": config.neighbour_range_m,
+            "max_speed_m_s": config.max_speed_m_s,
+            "knows_learner": config.learner_is_known,
+        },
+        "colours": list(GROUP_COLOURS),
+        "states": list(STATE_NAMES),
+    }
+
+
+def _byte_planes(units: NDArray[np.int16]) -> bytes:
+    """Differences along the first axis, modulo 2^16, all low bytes before all high bytes: they pack to a third."""
+    differences = np.diff(units, axis=0, prepend=np.zeros_like(units[:1])).astype("<i2")
+    return differences.view(np.uint8).reshape(-1, 2).T.tobytes()

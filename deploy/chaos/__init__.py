@@ -1,0 +1,1 @@
+"""Fault injection: a training whose processes are killed, frozen and delayed."""

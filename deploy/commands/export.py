@@ -1,0 +1,125 @@
+"""`shoal export`: a trained policy as ONNX and as a torch ExportedProgram, for robots and other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+from torch import nn
+
+from actors.policy.network import QNetwork, WeightsSnapshot, load_snapshot
+from actors.rollout.vector_env import env_shape
+from deploy.options.results import Export
+from deploy.runs.folders import make_folder
+from deploy.runs.policy_lookup import find_policy
+from learner.checkpoints.checkpoint import read_checkpoint
+from learner.checkpoints.manifest import MANIFEST
+from learner.checkpoints.store import FolderStore
+from learner.config import RunConfig, config_hash, to_dict
+from learner.export.policy_file import read_policy, read_saved_policy
+from learner.export.ports import FRAME, Port, bare_inputs, bare_outputs, robot_inputs, robot_outputs
+from learner.export.reference_states import Sensed, observed_states, swarm_states
+from learner.export.robot_policy import BarePolicy, make_robot
+from learner.export.write import Agreement, check_packages, write_export
+from learner.run_folder import RunFolder, find_run
+from learner.tracking.mlflow_run import git_commit
+from sim_core.checks import require
+
+FORMAT = "shoal-policy-1"
+
+
+class Source(NamedTuple):
+    """Where a policy comes from: its run, the config, the weights, and the file or folder that was named."""
+
+    folder: RunFolder
+    config: RunConfig
+    weights: WeightsSnapshot
+
+
+def find_source(name: str, runs_dir: Path) -> Source:
+    """The policy of a run, of one of its checkpoints, or of a policy file in a run's folder.
+
+    Raises:
+      ConfigError: there is none, or it does not fit its run's config.
+    """
+    path = Path(name)
+    if path.is_file():
+        folder = find_run(str(path.absolute().parent), runs_dir)
+        config = folder.config()
+        return Source(folder, config, read_saved_policy(path, config, env_shape(config.env)))
+    if (path / MANIFEST).is_file():
+        folder = find_run(str(path.absolute().parent.parent), runs_dir)
+        config = folder.config()
+        checkpoint = read_checkpoint(FolderStore(path.absolute().parent), path.absolute().name)
+        return Source(folder, config, read_policy(checkpoint, config, env_shape(config.env)))
+    folder = find_run(name, runs_dir)
+    config = folder.config()
+    return Source(folder, config, find_policy(folder, config))
+
+
+class _Parts(NamedTuple):
+    """What is exported: the module, its ports, and the states to check it on."""
+
+    module: nn.Module
+    inputs: list[Port]
+    outputs: list[Port]
+    states: Sensed
+
+
+def _parts(command: Export, config: RunConfig, weights: WeightsSnapshot) -> _Parts:
+    shape = env_shape(config.env)
+    network = QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions)
+    load_snapshot(network, weights)
+    if command.bare:
+        states = observed_states(config.env, weights, command.first_seed, command.states)
+        return _Parts(BarePolicy(network), bare_inputs(shape), bare_outputs(shape), states)
+    world = config.world
+    states = swarm_states(world, weights, weights, command.first_seed, command.states)
+    return _Parts(make_robot(network, world), robot_inputs(world), robot_outputs(world), states)
+
+
+def metadata(config: RunConfig, weights: WeightsSnapshot, bare: bool) -> dict[str, Any]:
+    """What an exported file says of itself, beside its inputs and outputs."""
+    world = config.world
+    robot = {} if bare else {"method": world.method, "setup": world.setup, "frame": FRAME}
+    timing = {} if bare else {"time_step_s": world.time_step_s, "outer_radius_m": world.outer_radius_m}
+    origin = {"run": config.name, "config_hash": config_hash(config), "updates": weights.version}
+    settings = {"commit": git_commit(), "settings": to_dict(config)}
+    return {"format": FORMAT, "env_id": config.env_id, **robot, **timing, **origin, **settings}
+
+
+def export(command: Export) -> int:
+    """Writes the export; returns the exit code."""
+    check_packages()
+    folder, config, weights = find_source(command.run, command.runs_dir)
+    require(
+        command.bare or config.world.sector_frame == "world",
+        "a robot's export takes positions in the world's frame, but this policy was trained with sector_frame = goal; "
+        "export observation to action values with --bare True",
+    )
+    require(
+        config.env.is_swarm or command.bare,
+        f"what a robot senses in {config.env_id} is not known; export observation to action values with --bare True",
+    )
+    out = command.out or folder.artifacts / ("export-bare" if command.bare else "export")
+    make_folder(out.absolute().parent, "--out")
+    parts = _parts(command, config, weights)
+    found = write_export(out, *parts[:3], metadata(config, weights, command.bare), parts.states)
+    console = Console()
+    console.print(agreement_table(found))
+    console.print(str(out), highlight=False, soft_wrap=True)
+    return 0
+
+
+def agreement_table(found: dict[str, Agreement]) -> Table:
+    """How exported files answer beside the simulator and its policy."""
+    states = next(iter(found.values())).states
+    table = Table(title=f"beside the simulator and its policy, in {states:,} states of rollouts")
+    names = list(next(iter(found.values())).errors)
+    for column in ("file", "decided otherwise", *(f"largest error: {name}" for name in names)):
+        table.add_column(column, justify="right")
+    for file, answer in found.items():
+        table.add_row(file, str(answer.different), *(f"{answer.errors[name]:.1e}" for name in names))
+    return table

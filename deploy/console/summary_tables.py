@@ -1,0 +1,49 @@
+"""Tables that commands end with."""
+
+from __future__ import annotations
+
+import shlex
+
+from rich.table import Table
+
+from actors.evaluation.statistics import Estimate
+from learner.run import RunResult
+from learner.run_folder import RunFolder
+from learner.training.evaluation_summary import Evaluation, outcome_label
+
+
+def evaluation_table(evaluation: Evaluation, title: str, kind: str = "greedy episodes") -> Table:
+    """Every outcome's rate, the return and the length, with 95 % intervals."""
+    table = Table(title=f"{title}: {evaluation.episodes} {kind}", title_justify="left")
+    table.add_column("result")
+    table.add_column("value", justify="right")
+    table.add_column("95 % interval", justify="right")
+    for outcome, estimate in evaluation.rates.items():
+        table.add_row(outcome_label(outcome).replace("_", " "), *_percent(estimate))
+    table.add_row("mean return", *_plain(evaluation.episode_return, 2))
+    table.add_row("mean episode length (env steps)", *_plain(evaluation.episode_length, 1))
+    return table
+
+
+def _percent(estimate: Estimate) -> tuple[str, str]:
+    value, low, high = (100 * number for number in estimate)
+    return f"{value:.1f} %", f"{low:.1f} … {high:.1f} %"
+
+
+def _plain(estimate: Estimate, digits: int) -> tuple[str, str]:
+    return f"{estimate.value:.{digits}f}", f"{estimate.low:.{digits}f} … {estimate.high:.{digits}f}"
+
+
+def summary_lines(folder: RunFolder, result: RunResult, tracking_uri: str, is_swarm: bool) -> list[str]:
+    """What a finished run left behind, and how to look at it; lines, so that paths can be copied whole."""
+    lines = {
+        "trained": f"{result.env_steps:,} env steps, {result.updates:,} updates",
+        "checkpoint": str(result.checkpoint or "of its end: could not be written"),
+        "curve": str(folder.artifacts / "learning_curve.png"),
+        "animation": str(folder.artifacts / ("episode.html" if is_swarm else "episode.mp4")),
+        "MLflow UI": tracking_uri,
+        "evaluate": f"shoal evaluate {shlex.quote(str(folder.path))}",
+    }
+    if tracking_uri.startswith("sqlite:"):
+        lines["MLflow UI"] = f"mlflow ui --backend-store-uri {shlex.quote(tracking_uri)}"
+    return [f"{name:<11}{text}" for name, text in lines.items()]

@@ -1,0 +1,141 @@
+"""What a person sees while a run trains: a live line in a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import math
+import time
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from learner.tracking.journal import Row
+
+PLAIN_INTERVAL_S = 5.0
+"""Least time between two plain lines."""
+
+
+class LatestMetrics:
+    """The newest value of every metric, since rows carry only what they measured."""
+
+    def __init__(self) -> None:
+        self._values: dict[str, float] = {}
+
+    def update(self, row: Row) -> None:
+        """Takes a row's values."""
+        self._values |= row.metrics
+
+    def text(self) -> str:
+        """One line: success or return, in training and evaluated, and the speeds."""
+        parts = [self._score("eval"), self._score("train")]
+        parts += [
+            f"{self._values.get('speed/env_steps_per_s', 0):,.0f} env steps/s",
+            f"{self._values.get('speed/updates_per_s', 0):,.0f} updates/s",
+        ]
+        return "  ".join(part for part in parts if part)
+
+    def _score(self, prefix: str) -> str:
+        success = self._values.get(f"{prefix}/success_rate")
+        if success is not None:
+            return f"{prefix} success {100 * success:.0f}%"
+        value = self._values.get(f"{prefix}/return")
+        return "" if value is None else f"{prefix} return {value:.1f}"
+
+
+class PlainDisplay:
+    """Lines for logs: at most one every few seconds.
+
+    Args:
+      console: where to print.
+      total_env_steps: env steps of the whole run.
+    """
+
+    def __init__(self, console: Console, total_env_steps: int) -> None:
+        self._console = console
+        self._total = total_env_steps
+        self._latest = LatestMetrics()
+        self._first: tuple[float, int] | None = None
+        self._last_s = -math.inf
+
+    def __enter__(self) -> Self:
+        """Nothing to set up."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing to put back."""
+
+    def row(self, row: Row) -> None:
+        """Prints the newest metrics, unless it just did."""
+        self._latest.update(row)
+        now_s = time.monotonic()
+        self._first = self._first or (now_s, row.env_steps)
+        if now_s - self._last_s < PLAIN_INTERVAL_S:
+            return
+        self._last_s = now_s
+        share = row.env_steps / self._total
+        line = f"{row.env_steps:,} env steps ({share:.0%})  {self._latest.text()}{self._left(now_s, row.env_steps)}"
+        self._console.print(line, highlight=False, soft_wrap=True)
+
+    def _left(self, now_s: float, env_steps: int) -> str:
+        start_s, start_steps = self._first or (now_s, env_steps)
+        if env_steps <= start_steps:
+            return ""
+        left_s = (self._total - env_steps) * (now_s - start_s) / (env_steps - start_steps)
+        return f"  {max(0.0, left_s):.0f} s left"
+
+    def message(self, text: str) -> None:
+        """Prints a line."""
+        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+class LiveDisplay:
+    """A progress bar that stays in place, with the newest metrics under it.
+
+    Args:
+      console: the terminal.
+      total_env_steps: env steps of the whole run.
+    """
+
+    def __init__(self, console: Console, total_env_steps: int) -> None:
+        self._latest = LatestMetrics()
+        self._progress = Progress(
+            BarColumn(bar_width=24),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[metrics]}"),
+            console=console,
+        )
+        self._task = self._progress.add_task("training", total=total_env_steps, metrics="starting")
+
+    def __enter__(self) -> Self:
+        """Starts drawing."""
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stops drawing; the last state stays."""
+        self._progress.stop()
+
+    def row(self, row: Row) -> None:
+        """Moves the bar on."""
+        self._latest.update(row)
+        done = max(row.env_steps, self._progress.tasks[0].completed)
+        self._progress.update(self._task, completed=done, metrics=self._latest.text())
+
+    def message(self, text: str) -> None:
+        """Prints a line above the bar."""
+        self._progress.console.print(text, markup=False, highlight=False)
+
+
+def make_display(console: Console, total_env_steps: int) -> LiveDisplay | PlainDisplay:
+    """The display that suits the console."""
+    if console.is_terminal and not console.is_dumb_terminal:
+        return LiveDisplay(console, total_env_steps)
+    return PlainDisplay(console, total_env_steps)

@@ -1,0 +1,1 @@
+"""Finding runs and policies, and the files they leave."""

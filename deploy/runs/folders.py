@@ -1,0 +1,79 @@
+"""Folders and files that the command line writes to."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from actors.storage.uri import Location, as_location, check_writable, inside
+from learner.checkpoints.store import open_store
+from learner.run_folder import Storage
+from sim_core.checks import ConfigError, require
+
+JOB = "RAY_JOB_CONFIG_JSON_ENV_VAR"
+"""Ray sets it for the command of a submitted job."""
+
+
+def check_lasting(runs_dir: Path) -> None:
+    """Raises ConfigError where `--runs-dir` lies in the copy of its folder that a Ray job runs in."""
+    require(
+        runs_dir.is_absolute() or JOB not in os.environ,
+        f"a Ray job runs in a copy of its folder, where --runs-dir {runs_dir} would be lost; name an absolute path",
+    )
+
+
+def make_folder(path: Path, flag: str) -> None:
+    """Makes the folder that a flag names, if it is missing.
+
+    Raises:
+      ConfigError: it cannot be made or written to.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{flag} {path} cannot be made ({error}); name a folder that you may write to") from error
+    require(os.access(path, os.W_OK), f"{flag} {path} cannot be written to; name a folder that you may write to")
+
+
+def run_location(checkpoint_url: str, name: str) -> Location:
+    """Where the checkpoints of the run `name` lie under `--checkpoint-url` (see `as_location` for errors)."""
+    return inside(as_location(checkpoint_url), name)
+
+
+def new_storage(checkpoint_url: str | None, name: str, keep_best: int) -> Storage:
+    """How a new run `name` stores its checkpoints: under `--checkpoint-url`, in a folder of its own there.
+
+    Raises:
+      ConfigError: nothing can be written there, or a run of that name has checkpoints there.
+    """
+    if checkpoint_url is None:
+        return Storage(None, keep_best)
+    root, location = as_location(checkpoint_url), run_location(checkpoint_url, name)
+    if isinstance(root, Path):
+        make_folder(root, "--checkpoint-url")
+    else:
+        check_writable(root)
+    try:
+        taken = open_store(location).names()
+    except OSError as error:
+        raise ConfigError(f"--checkpoint-url {location} cannot be listed ({error}); name another one") from error
+    require(
+        not taken, f"--checkpoint-url {location} holds the checkpoints of another run; choose another --name or URL"
+    )
+    return Storage(str(location), keep_best)
+
+
+def check_plain_name(name: str) -> None:
+    """Raises ConfigError unless `--name` names a folder within another, and none elsewhere."""
+    plain = name == Path(name).name and name not in ("", ".", "..")
+    require(plain, f"--name must be a plain folder name, not {name!r}")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a file; an older one is replaced once the new is whole."""
+    part = path.with_name(path.name + ".part")
+    with part.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)

@@ -1,0 +1,1 @@
+"""Policies as files: safetensors, ONNX, ExportedProgram."""

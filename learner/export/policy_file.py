@@ -1,0 +1,73 @@
+"""A trained policy as a file of its own, or read out of a checkpoint without starting the run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from actors.policy.network import NETWORKS, DuelingNetwork, QNetwork, WeightsSnapshot, load_snapshot, snapshot
+from actors.rollout.vector_env import EnvShape
+from actors.storage.uri import fetched, inside
+from learner.checkpoints.checkpoint import Checkpoint
+from learner.checkpoints.manifest import CheckpointError, damaged
+from learner.config import RunConfig
+from learner.update.learner_node import WEIGHTS
+
+ONLINE = "online."
+
+
+def read_policy(checkpoint: Checkpoint, config: RunConfig, shape: EnvShape) -> WeightsSnapshot:
+    """The online network's weights of a checkpoint.
+
+    Raises:
+      CheckpointError: the weights do not fit a network of `config` on environments of `shape`.
+    """
+    updates = checkpoint.state.get("updates")
+    if type(updates) is not int:
+        raise damaged(checkpoint.folder, "state.json has no number of updates")
+    network = NETWORKS[config.network](shape.observation_size, config.hidden_sizes, shape.num_actions)
+    with fetched(inside(checkpoint.folder, WEIGHTS)) as path:
+        return _read(path, updates, network)
+
+
+def save_policy(path: Path, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> None:
+    """Writes a policy to a file of its own, as a plain network; an older one is replaced once the new is whole."""
+    network = QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions)
+    load_snapshot(network, weights)
+    tensors = {f"{ONLINE}{name}": tensor for name, tensor in network.state_dict().items()}
+    part = path.with_name(path.name + ".part")
+    save_file(tensors, str(part), metadata={"updates": str(weights.version)})
+    part.replace(path)
+
+
+def read_saved_policy(path: Path, config: RunConfig, shape: EnvShape) -> WeightsSnapshot:
+    """The policy that `save_policy` wrote.
+
+    Raises:
+      CheckpointError: the file cannot be read, or does not fit a network of `config` on environments of `shape`.
+    """
+    try:
+        with safe_open(str(path), "pt") as file:
+            updates = int((file.metadata() or {})["updates"])
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        raise CheckpointError(f"the policy {path} cannot be read ({error}); train anew") from error
+    return _read(path, updates, QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions))
+
+
+def _read(path: Path, updates: int, network: QNetwork | DuelingNetwork) -> WeightsSnapshot:
+    try:
+        network.load_state_dict(_online(load_file(str(path))))
+    except (RuntimeError, OSError, SafetensorError) as error:
+        raise CheckpointError(
+            f"the policy {path} takes other observations or actions than this setup: name a run whose "
+            "hidden_sizes, network, sectors, stop_action and sensor_counts (for M_IN and M_OUT also method and groups) "
+            "are those of its config"
+        ) from error
+    return snapshot(network, updates, 0.0)
+
+
+def _online(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(ONLINE): tensor for name, tensor in tensors.items() if name.startswith(ONLINE)}

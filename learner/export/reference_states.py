@@ -1,0 +1,123 @@
+"""What a robot of `robot_policy` senses in states of real rollouts, and what the simulator decides there.
+
+This is the other side of the comparison that every export passes: the simulator's own perception, the numpy
+policy that rollout workers act with, and the simulator's velocity.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.evaluation.evaluator import Candidate, make_player
+from actors.policy.network import Policy, WeightsSnapshot
+from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
+from sim_core import ENV_ID
+from sim_core.config import WorldConfig
+from sim_core.worlds import WorldBatch, is_done
+
+MAX_WORLDS = 100
+"""Worlds that play at once."""
+EVERY_STEPS = 5
+"""Env steps between two states of a world that are taken."""
+
+
+class Sensed(NamedTuple):
+    """States: the inputs by name, and what is expected of them by output name; first axis: `[states, ...]`."""
+
+    inputs: dict[str, NDArray[Any]]
+    expected: dict[str, NDArray[Any]]
+
+
+def relative_inputs(worlds: WorldBatch) -> dict[str, NDArray[Any]]:
+    """What the learning robots of a batch of worlds sense, as the inputs of `learner.export.robot_policy`.
+
+    In the own group the place of the robot itself is masked.
+    """
+    config, learner = worlds.config, worlds.state.learner
+    rows = np.arange(worlds.num_worlds)
+    positions = worlds.positions()
+    itself = positions[rows, learner]
+    relative = (positions - itself[:, None]).reshape(-1, config.groups, config.robots, 2)
+    mask = np.ones(relative.shape[:3], np.bool_)
+    mask[rows, learner // config.robots, learner % config.robots] = False
+    order = (learner[:, None] // config.robots + np.arange(config.groups)) % config.groups  # the own group first
+    relative, mask = (np.take_along_axis(x, _wide(order, x.ndim), axis=1) for x in (relative, mask))
+    if config.method == "sensor":
+        return {
+            "own": relative[:, 0],
+            "own_mask": mask[:, 0],
+            "other": relative[:, 1:].reshape(len(rows), -1, 2),
+            "other_mask": mask[:, 1:].reshape(len(rows), -1),
+        }
+    goals = worlds.goals() - itself[:, None]
+    return {"positions": relative, "mask": mask, "goals": np.take_along_axis(goals, _wide(order, 3), axis=1)}
+
+
+def _wide(order: NDArray[Any], dimensions: int) -> NDArray[Any]:
+    return order.reshape(*order.shape, *(1,) * (dimensions - 2))
+
+
+def swarm_states(config: WorldConfig, driver: Candidate, weights: WeightsSnapshot, seed: int, count: int) -> Sensed:
+    """`count` states of rollouts in our own world, episodes from `seed` on.
+
+    Args:
+      config: the world.
+      driver: who drives the learning robots while states are taken.
+      weights: the policy that is asked in every state.
+      seed: seed of the first episode.
+      count: states to take.
+
+    Returns:
+      Inputs of the module of `config.method`, and the simulator's `velocity`, `action`, `action_values` and
+      `observation`.
+    """
+    size = min(MAX_WORLDS, count)
+    seeds = list(range(seed, seed + size))
+    worlds, policy = WorldBatch(config, size), Policy(weights)
+    player = make_player(EnvSpec(ENV_ID, config), driver, seeds)
+    worlds.seed(seeds)
+    observation, taken = worlds.reset(), list[Sensed]()
+    for step in range(EVERY_STEPS * -(-count // size)):
+        if step % EVERY_STEPS == 0:
+            taken.append(Sensed(relative_inputs(worlds), _decided(worlds, policy, observation)))
+        result = worlds.step(player.act(observation))
+        done = is_done(result.outcome)
+        observation = worlds.reset(done) if done.any() else result.observation
+    return _joined(taken, count)
+
+
+def _decided(worlds: WorldBatch, policy: Policy, observation: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    values, action = policy.values(observation), policy.greedy(observation)
+    velocity = np.zeros((2, worlds.num_worlds), np.float32)
+    worlds.method.velocity(worlds.state, action, velocity[0], velocity[1])
+    seen = observation.astype(np.float32)
+    return {"velocity": velocity.T, "action": action, "action_values": values, "observation": seen}
+
+
+def _joined(taken: list[Sensed], count: int) -> Sensed:
+    def joined(parts: list[dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+        return {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
+
+    return Sensed(joined([part.inputs for part in taken]), joined([part.expected for part in taken]))
+
+
+def observed_states(spec: EnvSpec, weights: WeightsSnapshot, seed: int, count: int) -> Sensed:
+    """`count` observations of greedy rollouts in any environment, episodes from `seed` on, and the policy's answers.
+
+    Returns:
+      `observation` as the environment gives it; expected `action` and `action_values`.
+    """
+    size = min(MAX_WORLDS, count)
+    policy = Policy(weights)
+    env = make_vector_env(spec, size)
+    observation, taken = reset_seeded(env, list(range(seed, seed + size))), list[Sensed]()
+    for _ in range(-(-count // size)):
+        action = policy.greedy(observation)
+        expected: dict[str, NDArray[Any]] = {"action": action, "action_values": policy.values(observation)}
+        taken.append(Sensed({"observation": observation.copy()}, expected))
+        observation = env.step(action)[0]
+    env.close()
+    return _joined(taken, count)

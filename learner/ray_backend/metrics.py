@@ -1,0 +1,45 @@
+"""A run's rows as Ray metrics, which every node offers to Prometheus; names and meanings are in `metric_names`."""
+
+from __future__ import annotations
+
+import math
+
+from ray.util.metrics import Counter, Gauge
+
+from learner.tracking.journal import Row
+from learner.tracking.metric_names import ENV_STEPS, METRICS, Exported
+
+RUN = "run"
+"""The label that tells runs apart."""
+
+
+class RayMetrics:
+    """Shows the newest values of a run; needs a Ray that this process has joined.
+
+    Args:
+      run: the run's name, a label of every metric.
+    """
+
+    def __init__(self, run: str) -> None:
+        self._labels = {RUN: run}
+        self._gauges = {known.journal: _made(Gauge, known) for known in METRICS if known.kind == "gauge"}
+        self._counters = {known.journal: _made(Counter, known) for known in METRICS if known.kind == "counter"}
+        self._counted = dict.fromkeys(self._counters, 0.0)
+        self._newest: dict[str, float] = {}
+
+    def row(self, row: Row) -> None:
+        """Shows a row, and what earlier ones measured: Ray forgets a gauge that is not set for two of its reports."""
+        self._newest |= row.metrics | {ENV_STEPS: row.env_steps}
+        for name, gauge in self._gauges.items():
+            value = self._newest.get(name, math.nan)
+            if math.isfinite(value):
+                gauge.set(value, tags=self._labels)
+        for name, counter in self._counters.items():
+            more = self._newest.get(name, 0.0) - self._counted[name]  # an evaluation's row is of an earlier env step
+            if more > 0:
+                counter.inc(more, tags=self._labels)
+                self._counted[name] += more
+
+
+def _made(kind: type[Counter] | type[Gauge], known: Exported) -> Counter | Gauge:
+    return kind(known.name, f"{known.unit}: {known.meaning}", (RUN,))

@@ -1,0 +1,1 @@
+"""A grid of trainings: its cells, and running them on Ray Tune."""

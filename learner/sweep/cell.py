@@ -1,0 +1,221 @@
+"""One cell of a sweep, from its training to its results, resumable at any moment.
+
+A cell's folder is a run's folder with `results.csv` in it, written last: where it stands, the cell is done. Its
+MLflow run is found again by the cell's key, so that no crash makes a second one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from actors.evaluation.evaluation_store import StoredEvaluation, save_evaluation
+from actors.evaluation.evaluator import evaluate
+from actors.evaluation.result_table import LEARNED, ResultRow, read_table, write_table
+from actors.policy.baselines import Baseline
+from actors.policy.network import WeightsSnapshot
+from actors.rollout.vector_env import env_shape
+from actors.service.messages import EpisodeStats
+from learner.checkpoints.checkpoint import Checkpoint
+from learner.config import RunConfig
+from learner.export.policy_file import read_saved_policy, save_policy
+from learner.file_names import EVALUATIONS
+from learner.run import RunResult, execute, last_checkpoint
+from learner.run_folder import RunFolder, RunIdentity
+from learner.sweep.grid import Cell, SweepConfig, cell_hash, done_cells, other_worlds
+from learner.tracking.journal import Row
+from learner.tracking.mlflow_run import Tracker
+from learner.tracking.redaction import public_uri
+from learner.training.cluster import Place
+from learner.training.evaluation_summary import as_metrics, score, summarise
+from sim_core.config import WorldConfig
+from sim_core.outcomes import ENDED
+
+
+class SweepPlace(NamedTuple):
+    """Where a sweep's cells lie and are logged."""
+
+    cells: Path
+    tracking_uri: str
+    experiment: str
+
+    @property
+    def sweep(self) -> str:
+        """The sweep's name: that of the folder which holds its cells."""
+        return self.cells.parent.name
+
+
+class RowDisplay:
+    """Passes a run's rows on; implements `learner.tracking.observer.Display`.
+
+    Args:
+      on_row: is called with every row.
+    """
+
+    def __init__(self, on_row: Callable[[Row], None]) -> None:
+        self._on_row = on_row
+
+    def row(self, row: Row) -> None:
+        """Passes the row on."""
+        self._on_row(row)
+
+    def message(self, text: str) -> None:
+        """A cell says nothing."""
+
+
+def result_row(sweep: SweepConfig, cell: Cell, played: WorldConfig, stats: EpisodeStats) -> ResultRow:
+    """The row of one evaluation of a cell's policy, in the world `played`."""
+    config = cell.config
+    counts = {kind.name.lower(): int((stats.outcome == kind).sum()) for kind in ENDED}
+    return ResultRow(
+        preset=sweep.label,
+        policy=cell.policy,
+        method=played.method,
+        trained_robots=config.world.robots,
+        trained_groups=config.world.groups,
+        seed=config.seed,
+        robots=played.robots,
+        groups=played.groups,
+        episodes=len(stats.outcome),
+        **counts,
+        mean_length_steps=round(float(np.mean(stats.length_steps)), 2),
+        config=cell_hash(config),
+    )
+
+
+def _start_or_find(cell: Cell, sweep: SweepConfig, folder: RunFolder, place: SweepPlace) -> Tracker:
+    """The cell's MLflow run: that of its folder, or one that carries its key, or a new one."""
+    tracker = Tracker(place.tracking_uri, place.experiment, None)
+    known = tracker.find_run({"cell": cell.key, "sweep": place.sweep})
+    if known:
+        tracker.resume(known)
+        tracker.log_inputs(cell.config)  # which a kill may have kept from it
+    else:
+        tracker.start(cell.config, {"sweep": place.sweep} | _tags(cell, sweep))
+    folder.save_config(cell.config)
+    folder.save_identity(RunIdentity(cell.name, public_uri(tracker.uri), place.experiment, tracker.run_id))
+    return tracker
+
+
+def _tags(cell: Cell, sweep: SweepConfig) -> dict[str, str]:
+    return {
+        "cell": cell.key,
+        "preset": sweep.label,
+        "policy": cell.policy,
+        "setup": cell.config.world.setup,
+        "mlflow.runName": cell.name,
+    }
+
+
+def run_cell(sweep: SweepConfig, cell: Cell, place: SweepPlace, on_row: Callable[[Row], None]) -> Path:
+    """Trains and evaluates a cell in this process, from where an earlier attempt was.
+
+    Args:
+      sweep: the sweep.
+      cell: one of its cells.
+      place: where it lies.
+      on_row: is called with every row of training metrics.
+
+    Returns:
+      The cell's table of results.
+    """
+    folder = RunFolder(place.cells / cell.key)
+    if folder.results.is_file() and done_cells(sweep, [cell], read_table(folder.results)):
+        return folder.results
+    checkpoint = last_checkpoint(folder, cell.config)
+    tracker = _start_or_find(cell, sweep, folder, place)
+    if cell.policy != LEARNED:
+        with tracker.ending():
+            _play_baseline(sweep, cell, folder, tracker)
+    elif folder.policy.is_file() and not folder.checkpoints.exists():
+        with tracker.ending():
+            _play_again(sweep, cell, folder, tracker)
+    else:
+        _train(sweep, cell, folder, tracker, checkpoint, on_row)  # ends its MLflow run itself
+    _new_table(folder).rename(folder.results)  # once MLflow has all and its run is closed
+    shutil.rmtree(folder.checkpoints, ignore_errors=True)  # the policy and the results stay
+    return folder.results
+
+
+def _train(
+    sweep: SweepConfig,
+    cell: Cell,
+    folder: RunFolder,
+    tracker: Tracker,
+    checkpoint: Checkpoint | None,
+    on_row: Callable[[Row], None],
+) -> None:
+    """Trains from a checkpoint or the start, and evaluates the policy."""
+    if checkpoint is None:
+        tracker.skip_what_is_logged()  # the same cell makes the same rows again, at another time
+
+    def finish(result: RunResult, rows: list[Row]) -> None:
+        assert result.weights is not None and result.episodes is not None and result.evaluation is not None
+        shape = env_shape(cell.config.env)
+        save_policy(folder.policy, result.weights, cell.config, shape)
+        results = _evaluate_all(sweep, cell, folder, result.weights, result.episodes)
+        tracker.artifact(folder.policy)
+        tracker.log_policy(result.weights, cell.config, shape, score(result.evaluation))
+        _log_table(results, folder, tracker)
+
+    execute(folder, cell.config, tracker, RowDisplay(on_row), checkpoint, Place(), finish)
+
+
+def _fixed_seeds(cell: Cell) -> list[int]:
+    first = cell.config.final_eval_first_seed
+    return list(range(first, first + cell.config.final_eval_episodes))
+
+
+def _play_again(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker) -> None:
+    """Evaluates the kept policy of a cell that was done, in a sweep that wants it played in more setups."""
+    weights = read_saved_policy(folder.policy, cell.config, env_shape(cell.config.env))
+    fixed = evaluate(cell.config.env, weights, _fixed_seeds(cell))
+    _log_table(_evaluate_all(sweep, cell, folder, weights, fixed), folder, tracker)
+
+
+def _play_baseline(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker) -> None:
+    """Plays a baseline's episodes, of which there is nothing to resume."""
+    stats = evaluate(cell.config.env, Baseline(cell.policy), _fixed_seeds(cell))
+    tracker.final(as_metrics(summarise(stats)), tracker.started_ms)
+    _log_table([_stored(sweep, cell, cell.config, stats, folder, 0)], folder, tracker)
+
+
+def _log_table(results: list[ResultRow], folder: RunFolder, tracker: Tracker) -> None:
+    """Writes and logs the table of a cell's results, which does not count yet."""
+    table = _new_table(folder)
+    write_table(table, results)
+    tracker.artifact(table)
+
+
+def _new_table(folder: RunFolder) -> Path:
+    return folder.artifacts / folder.results.name
+
+
+def _evaluate_all(
+    sweep: SweepConfig, cell: Cell, folder: RunFolder, weights: WeightsSnapshot, fixed: EpisodeStats
+) -> list[ResultRow]:
+    """Stores the Fixed evaluation, makes and stores the Extrapolations, and counts them all."""
+    config = cell.config
+    results = [_stored(sweep, cell, config, fixed, folder, weights.version)]
+    seeds = list(range(sweep.first_seed, sweep.first_seed + sweep.extrapolation_episodes))
+    for world in other_worlds(sweep, cell):
+        played = dataclasses.replace(config, world=world)
+        results.append(_stored(sweep, cell, played, evaluate(played.env, weights, seeds), folder, weights.version))
+    return results
+
+
+def _stored(
+    sweep: SweepConfig, cell: Cell, played: RunConfig, stats: EpisodeStats, folder: RunFolder, updates: int
+) -> ResultRow:
+    world = played.world
+    path = folder.path / EVALUATIONS / f"{world.robots}r{world.groups}g.zarr"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(path, ignore_errors=True)  # of an attempt that did not come to its end
+    seeds = np.arange(sweep.first_seed, sweep.first_seed + len(stats.outcome))
+    save_evaluation(path, StoredEvaluation(played.env, cell.name, updates, seeds, stats))
+    return result_row(sweep, cell, world, stats)

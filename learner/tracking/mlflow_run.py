@@ -1,0 +1,259 @@
+"""The MLflow side of a run: one client with an explicit run id, in the driver alone."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import socket
+import subprocess
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import torch
+
+from actors.policy.network import QNetwork, WeightsSnapshot, load_snapshot
+from actors.rollout.vector_env import EnvShape
+from actors.service.fault_policy import first_line
+from learner.config import RunConfig, config_hash, flat_params
+from learner.tracking.journal import FINAL, Row, charted
+from learner.tracking.mlflow_views import TAG, packed_view, sweep_views
+from learner.tracking.redaction import hide_secrets, public_uri
+from sim_core.checks import ConfigError
+
+os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "30")
+
+import mlflow  # noqa: E402
+import mlflow.pytorch  # noqa: E402
+from mlflow.entities import Metric, Param, RunTag  # noqa: E402
+from mlflow.exceptions import MlflowException  # noqa: E402
+from mlflow.models import infer_signature  # noqa: E402
+from requests import RequestException  # noqa: E402
+from sqlalchemy.exc import SQLAlchemyError  # noqa: E402
+
+from learner.tracking.mlflow_registry import dataset_inputs, register_policy  # noqa: E402
+
+TROUBLE = (MlflowException, SQLAlchemyError, RequestException)
+"""What MLflow's client raises when its store does not do what it should."""
+PATIENCE_S = 600.0
+"""How long a finished run waits for a server that does not answer."""
+MAX_BATCH = 900
+"""Metrics of one request; MLflow takes at most 1,000."""
+CONNECT_TIMEOUT_S = 5.0
+
+
+def check_reachable(uri: str) -> None:
+    """Raises ConfigError unless a server answers where `uri` is an address; local stores pass."""
+    try:
+        parts = urlsplit(uri)
+        if parts.scheme not in ("http", "https"):
+            return
+        port = parts.port or (443 if parts.scheme == "https" else 80)
+        socket.create_connection((parts.hostname or "", port), CONNECT_TIMEOUT_S).close()
+    except (OSError, ValueError) as error:  # ValueError: no address at all
+        raise ConfigError(
+            f"no MLflow server answers at {public_uri(uri)} ({error}); start one with `mlflow server`, "
+            "or leave --tracking-uri out to log to a local file"
+        ) from error
+
+
+def mlflow_client(uri: str) -> mlflow.MlflowClient:
+    """A client of the store at `uri`, with MLflow's own chatter silenced."""
+    logging.getLogger("mlflow").setLevel(logging.ERROR)
+    logging.getLogger("alembic").setLevel(logging.ERROR)
+    return mlflow.MlflowClient(uri)
+
+
+class Tracker:
+    """One MLflow run.
+
+    Args:
+      uri: tracking URI.
+      experiment: experiment name; made if missing.
+      artifact_root: where a new experiment's artifacts go, None for the server's choice.
+
+    Raises:
+      ConfigError: the store cannot be opened.
+    """
+
+    def __init__(self, uri: str, experiment: str, artifact_root: str | None) -> None:
+        check_reachable(uri)
+        self.uri = uri
+        self.run_id = ""
+        self.started_ms = 0
+        """When the run began."""
+        self._logged: set[tuple[str, int]] = set()
+        try:
+            self._client = mlflow_client(uri)
+            found = self._client.get_experiment_by_name(experiment)
+            self._experiment_id = (
+                found.experiment_id if found else self._client.create_experiment(experiment, artifact_root)
+            )
+        except (MlflowException, SQLAlchemyError, OSError, ValueError, ImportError) as error:
+            reason = hide_secrets(first_line(error), uri)
+            raise ConfigError(
+                f"the MLflow store {public_uri(uri)} cannot be opened ({reason}); name another --tracking-uri"
+            ) from error
+
+    @property
+    def patience_s(self) -> float:
+        """How long to try what the store does not take: a server may come back, a file does not."""
+        return PATIENCE_S if self.uri.startswith(("http:", "https:")) else 0.0
+
+    @cached_property
+    def _commit(self) -> str:
+        return git_commit()
+
+    def start(self, config: RunConfig, tags: dict[str, str] | None = None) -> None:
+        """Creates the run, with the whole config as params and, with `tags`, what a user filters by as tags."""
+        known = {
+            "method": config.world.method if config.env.is_swarm else "none",
+            "robots": str(config.world.robots),
+            "groups": str(config.world.groups),
+            "seed": str(config.seed),
+            "engine": config.engine,
+            "config_hash": config_hash(config),
+            "mlflow.source.git.commit": self._commit,
+        }
+        run = self._client.create_run(self._experiment_id, tags={"mlflow.runName": config.name} | known | (tags or {}))
+        self.run_id, self.started_ms = run.info.run_id, run.info.start_time
+        self.log_inputs(config)
+
+    def log_inputs(self, config: RunConfig) -> None:
+        """Logs the whole config and the episodes it names; what the run has already must be the same."""
+        params = [Param(key, str(value)) for key, value in flat_params(config).items()]
+        self._client.log_batch(self.run_id, params=params)
+        self._client.log_inputs(self.run_id, datasets=dataset_inputs(config, self._commit))
+
+    def find_run(self, tags: dict[str, str]) -> str | None:
+        """Id of the experiment's oldest run that has all `tags`; None if there is none."""
+        has_all = " and ".join(f"tags.`{name}` = '{value}'" for name, value in tags.items())
+        found = self._client.search_runs(
+            [self._experiment_id], has_all, max_results=1, order_by=["attributes.start_time ASC"]
+        )
+        return found[0].info.run_id if found else None
+
+    def is_finished(self, run_id: str) -> bool:
+        """Whether the store knows a run as finished."""
+        try:
+            return bool(self._client.get_run(run_id).info.status == "FINISHED")
+        except MlflowException:
+            return False
+
+    def resume(self, run_id: str) -> None:
+        """Continues an existing run.
+
+        Raises:
+          ConfigError: the store does not know it.
+        """
+        try:
+            run = self._client.get_run(run_id)
+            attempts = int(run.data.tags.get("attempts", "1"))
+            self._client.update_run(run_id, status="RUNNING")
+            self._client.log_batch(run_id, tags=[RunTag("attempts", str(attempts + 1))])
+        except MlflowException as error:
+            raise ConfigError(
+                f"the MLflow store {public_uri(self.uri)} does not know run {run_id}; name the store it was logged to"
+            ) from error
+        self.run_id, self.started_ms = run_id, run.info.start_time
+
+    def skip_what_is_logged(self) -> None:
+        """Lets `push` leave out every metric at a step at which the run has it already."""
+        for key in self._client.get_run(self.run_id).data.metrics:
+            self._logged |= {(key, metric.step) for metric in self._client.get_metric_history(self.run_id, key)}
+
+    def push(self, rows: list[Row]) -> None:
+        """Mirrors journal rows without their accounts; a row that is there already is stored once."""
+        metrics = [
+            Metric(key, value, row.time_ms, row.env_steps)
+            for row in rows
+            for key, value in charted(row.metrics).items()
+            if math.isfinite(value) and (key, row.env_steps) not in self._logged
+        ]
+        for start in range(0, len(metrics), MAX_BATCH):
+            self._client.log_batch(self.run_id, metrics=metrics[start : start + MAX_BATCH])
+
+    def final(self, metrics: dict[str, float], time_ms: int) -> None:
+        """Logs the run's results at step 0, where the UI draws them as bars; the same of the same time only once."""
+        self.push([Row(0, time_ms, {f"{FINAL}{key}": value for key, value in metrics.items()})])
+
+    def log_policy(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape, score: float) -> None:
+        """Logs and registers the greedy policy's Q-network, a model from observations to action values.
+
+        Args:
+          weights: of the policy.
+          config: the run.
+          shape: its environments'.
+          score: what the registry compares the policies of a setup by.
+        """
+        network = QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions)
+        load_snapshot(network, weights)
+        example = np.zeros((2, *shape.observation_space.shape), np.float32)
+        with torch.no_grad():
+            values = network(torch.from_numpy(example)).numpy()
+        mlflow.set_tracking_uri(self.uri)
+        with warnings.catch_warnings(), mlflow.start_run(run_id=self.run_id):
+            warnings.simplefilter("ignore")  # MLflow's own, about its schema inference
+            logged = mlflow.pytorch.log_model(
+                network.eval(),
+                name="policy",
+                signature=infer_signature(example, values),
+                input_example=example,
+                serialization_format="pt2",
+                pip_requirements=[f"torch=={torch.__version__.split('+')[0]}", f"numpy=={np.__version__}"],
+            )
+        register_policy(self._client, config, self.run_id, logged, score)
+
+    def artifact(self, path: Path) -> None:
+        """Uploads a file or a folder to the run's artifacts."""
+        if path.is_dir():
+            self._client.log_artifacts(self.run_id, str(path), path.name)
+        else:
+            self._client.log_artifact(self.run_id, str(path))
+
+    def set_views(self) -> None:
+        """Gives the experiment the views of `mlflow_views`; a store that refuses them goes without."""
+        now_ms = int(time.time() * 1000)
+        for key, (name, state) in sweep_views().items():
+            try:
+                self._client.set_experiment_tag(self._experiment_id, TAG + key, packed_view(name, state, now_ms))
+            except MlflowException as error:
+                logging.getLogger(__name__).warning("no MLflow view %r: %s", name, first_line(error))
+
+    @contextmanager
+    def ending(self) -> Iterator[None]:
+        """Closes the run after the block: FINISHED, or FAILED by an error that passes on."""
+        status = "FAILED"
+        try:
+            yield
+            status = "FINISHED"
+        finally:
+            self.end(status)
+
+    def end(self, status: str) -> None:
+        """Closes the run as FINISHED, KILLED or FAILED."""
+        self._client.set_terminated(self.run_id, status)
+
+
+COMMIT = "SHOAL_COMMIT"
+"""Names the commit where the code is a copy without its history, as in a submitted job."""
+
+
+def git_commit() -> str:
+    """The commit of the checkout that this module lies in, or the one that SHOAL_COMMIT names; else `unknown`."""
+    if os.environ.get(COMMIT):
+        return os.environ[COMMIT]
+    here = Path(__file__).parent
+    try:
+        done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False)
+    except OSError:  # no git
+        return "unknown"
+    return done.stdout.strip() or "unknown"

@@ -1,0 +1,1 @@
+"""What the training loop is made of: counters, pacing, recovery, saving."""

@@ -1,0 +1,85 @@
+"""How far a run is: the driver's counters, accounts and sums, as state that a checkpoint holds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from actors.service.messages import BlockReport
+from learner.config import RunConfig
+from learner.tracking.journal import ACCOUNT
+from learner.training.ledger import Ledger
+from learner.training.meters import Meters
+from learner.training.pacing import Pacer, PacingState
+from learner.update.learner_node import UpdateReport
+
+
+class Progress:
+    """What the driver of a run counts.
+
+    Args:
+      config: the run.
+      pacer: its pacing.
+      ledger: its accounts.
+    """
+
+    def __init__(self, config: RunConfig, pacer: Pacer, ledger: Ledger) -> None:
+        self.env_steps = 0
+        self.updates = 0
+        self.pacer = pacer
+        self.ledger = ledger
+        self.meters = Meters()
+        self._every = {
+            "log": config.log_every_env_steps,
+            "eval": config.eval_every_env_steps,
+            "checkpoint": config.checkpoint_every_env_steps,
+        }
+        self._due = dict(self._every)
+
+    def take_block(self, report: BlockReport) -> None:
+        """Counts a block that a rollout worker reports."""
+        self.pacer.inserted(self.ledger.take(report))
+        self.meters.take_block(report)
+        self.env_steps += report.header.env_steps
+
+    def take_updates(self, report: UpdateReport, updates: int) -> None:
+        """Counts a call of updates."""
+        self.meters.take_updates(report, updates)
+        self.updates = report.version
+
+    def is_due(self, what: str) -> bool:
+        """Whether `env_steps` has passed the next multiple of what `what` is done every; moves on to the one after."""
+        if self.env_steps < self._due[what]:
+            return False
+        self._due[what] = (self.env_steps // self._every[what] + 1) * self._every[what]
+        return True
+
+    def row(self) -> dict[str, float]:
+        """The metrics of training since the last row, and the accounts."""
+        row = self.meters.row(self.ledger.replay_size, self.pacer.ratio()) | self.ledger.row()
+        pacing = self.pacer.state
+        counts = {
+            "sampled": pacing.sampled,
+            "updates": self.updates,
+            "waits_to_insert": pacing.waits_to_insert,
+            "waits_to_sample": pacing.waits_to_sample,
+        }
+        return row | {f"{ACCOUNT}{name}": float(count) for name, count in counts.items()}
+
+    def get_state(self) -> dict[str, Any]:
+        """All of it, for JSON; nothing that happens later changes it."""
+        return {
+            "env_steps": self.env_steps,
+            "updates": self.updates,
+            "pacing": self.pacer.state._asdict(),
+            "meters": self.meters.get_state(),
+            "ledger": self.ledger.get_state(),
+            "due": dict(self._due),
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Takes up what `get_state` gave."""
+        self.env_steps, self.updates = state["env_steps"], state["updates"]
+        self.pacer.state = PacingState(**state["pacing"])
+        self.meters.set_state(state["meters"])
+        self.ledger.set_state(state["ledger"])
+        self._due = {what: int(state["due"][what]) for what in self._due}

@@ -1,0 +1,73 @@
+"""How much memory a run needs, roughly: enough to refuse at the start what no machine could hold."""
+
+from __future__ import annotations
+
+import itertools
+
+import psutil
+
+from actors.rollout.vector_env import EnvShape, env_shape
+from actors.service.messages import transition_dtype
+from actors.service.packing import frames_of, packed_dtype
+from learner.config import RunConfig
+from sim_core.checks import require
+
+ROBOT_BYTES = 200
+"""Of one robot in one world: its state, neighbours and velocities."""
+PROCESS_BYTES = 150_000_000
+"""Of one Ray actor before it holds anything: Python, PyTorch and the simulator's kernels."""
+EPISODE_BYTES = 100
+"""Of one evaluated episode: its seed and its result."""
+PRIORITY_BYTES = 32
+"""Of one transition's priority: the sum tree has twice as many float64, of which half may lie idle."""
+FRAME_PLACES = 2
+"""Of one frame of the replay: their number is a power of 2, of which half may be empty."""
+NETWORK_COPIES = 5
+"""Online and target network, gradients, and Adam's two moments."""
+
+
+def parts_bytes(config: RunConfig, shape: EnvShape) -> dict[str, int]:
+    """Bytes of each part, by the settings that decide its size."""
+    transition = transition_dtype(shape.observation_space)
+    row, packed = transition.itemsize, packed_dtype(transition).itemsize
+    frames = frames_of(config.replay_capacity, config.steps_per_block, config.n_step)
+    priority = PRIORITY_BYTES if config.replay == "prioritised" else 0
+    widths = [shape.observation_size, *config.policy_sizes, shape.num_actions]
+    weights = sum(inputs * outputs + outputs for inputs, outputs in itertools.pairwise(widths))
+    robots = config.world.num_robots if config.env.is_swarm else 1
+    actors = config.workers + (config.replay_shards if config.replay_placement == "actors" else 0)
+    return {
+        "workers, envs_per_worker and robots": config.workers * config.envs_per_worker * robots * ROBOT_BYTES,
+        "workers and replay_shards": actors * PROCESS_BYTES if config.engine == "ray" else 0,
+        "envs_per_worker, steps_per_block and n_step": config.workers
+        * config.envs_per_worker
+        * (config.steps_per_block + config.n_step)
+        * row,
+        "replay_capacity": config.replay_capacity * (packed + priority)
+        + FRAME_PLACES * frames * transition["observation"].itemsize,
+        "batch_size and updates_per_call": 4 * config.batch_size * config.updates_per_call * row,
+        "hidden_sizes": 4 * NETWORK_COPIES * weights,
+        "eval_episodes and final_eval_episodes": EPISODE_BYTES * max(config.eval_episodes, config.final_eval_episodes),
+    }
+
+
+def check_fits(config: RunConfig) -> EnvShape:
+    """The spaces of a run's environment, which this machine has the memory for.
+
+    Raises:
+      ConfigError: it has not; or the environment cannot be made.
+    """
+    shape = env_shape(config.env)
+    parts, total = parts_bytes(config, shape), psutil.virtual_memory().total
+    largest = max(parts, key=lambda name: parts[name])
+    need = sum(parts.values())
+    require(
+        need <= total,
+        f"{config.name} needs about {_gigabytes(need)} of memory, {_gigabytes(parts[largest])} of it by {largest}, "
+        f"and this machine has {_gigabytes(total)}: lower them, or train on a cluster (--address)",
+    )
+    return shape
+
+
+def _gigabytes(count: int) -> str:
+    return f"{count // 10**9:,} GB" if count >= 10**10 else f"{count / 1e9:.1f} GB"

@@ -1,0 +1,49 @@
+"""M_OUT ("OUTforce"): the robot moves by the sum of the network's velocity and the potential field's (Alg. 4.2).
+
+The text bounds neither summand. Here u_apf is limited (see apf.py), and the sum is shortened to the learning robot's
+speed limit, which keeps its direction; with the default of 1 m/s it is never faster than u_nn or the swarm.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_core.config import WorldConfig
+from sim_core.jit import kernel
+from sim_core.methods.apf import field_of, field_params, limited
+from sim_core.methods.group_ellipses import EnclosedMethod
+from sim_core.methods.headings import heading_velocities, write_headings
+from sim_core.packed import packed
+from sim_core.state import WorldState
+
+
+@kernel
+def _add_field(state, out_x, out_y, speed_limit_m_s, params):
+    p = params[0]
+    for world in range(out_x.shape[0]):
+        pos_x, pos_y = state.pos_x[world], state.pos_y[world]
+        x, y = field_of(state.learner[world], 0, pos_x.shape[0], pos_x, pos_y, p)
+        out_x[world], out_y[world] = limited(out_x[world] + x, out_y[world] + y, speed_limit_m_s)
+
+
+class OutsideMethod(EnclosedMethod):
+    """M_OUT: m x 7 values (a, b, x_c, y_c, theta, x_g, y_g), velocity u_nn + u_apf."""
+
+    def __init__(self, config: WorldConfig) -> None:
+        """Takes its constants from `config`."""
+        super().__init__(config)
+        self._velocities = heading_velocities(config, np.float32)
+        self._field = packed(field_params(config))
+        self._speed_limit_m_s = float(config.learner_speed_limit_m_s)
+
+    def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
+        """u_l = u_nn + u_apf (4.2.2), with u_nn of Eq. 3.4.
+
+        Raises:
+          ValueError: there is not one action a world, or one is none of the actions.
+        """
+        write_headings(self._velocities, action, out_x, out_y)
+        _add_field(state, out_x, out_y, self._speed_limit_m_s, self._field)

@@ -1,0 +1,1 @@
+"""The swarm: start positions, neighbour search, flocking, one step of every world."""

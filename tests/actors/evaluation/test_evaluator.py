@@ -1,0 +1,170 @@
+"""Evaluation: one episode a seed, against one environment stepped in a plain loop."""
+
+import dataclasses
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from actors.evaluation import evaluator
+from actors.evaluation.evaluator import evaluate, evaluate_in_parts, record_episode, record_frames
+from actors.policy.baselines import Baseline
+from actors.policy.network import Policy
+from actors.rollout.vector_env import EnvSpec
+from actors.service.messages import NO_OUTCOME
+from actors.service.rpc import LocalCalls
+from sim_core import ENV_ID
+from sim_core.checks import ConfigError
+from sim_core.config import WorldConfig
+from sim_core.envs import SwarmEnv
+from sim_core.outcomes import Outcome
+from sim_core.worlds import WorldBatch
+
+SEEDS = [2_000_000_000 + i for i in range(7)]
+
+
+def play(env, policy, seed):
+    """(outcome, length, return) of one greedy episode."""
+    observation, _ = env.reset(seed=seed)
+    length, total, ended = 0, 0.0, False
+    while not ended:
+        observation, reward, terminated, truncated, info = env.step(policy.greedy(observation[None])[0])
+        length, total, ended = length + 1, total + reward, terminated or truncated
+    return info.get("outcome", NO_OUTCOME), length, total
+
+
+@pytest.mark.parametrize("name", ["swarm", "cart_pole"])
+def test_equals_single_episodes(name, request, make_weights):
+    spec = request.getfixturevalue(name)
+    weights = make_weights(spec, seed=3)
+    env = SwarmEnv(**vars(spec.world)) if spec.is_swarm else gym.make(spec.env_id)
+    expected = [play(env, Policy(weights), seed) for seed in SEEDS]
+    stats = evaluate(spec, weights, SEEDS)
+    assert list(zip(stats.outcome, stats.length_steps, strict=True)) == [row[:2] for row in expected]
+    np.testing.assert_allclose(stats.episode_return, [row[2] for row in expected], rtol=1e-9)
+    assert len(set(stats.length_steps)) > 1  # or short episodes could not be over-counted
+    env.close()
+
+
+@pytest.mark.parametrize("chunk", [1, 2, 3, 7])
+def test_does_not_depend_on_how_many_play_at_once(monkeypatch, swarm, make_weights, chunk):
+    weights = make_weights(swarm)
+    expected = evaluate(swarm, weights, SEEDS)
+    monkeypatch.setattr(evaluator, "MAX_ENVS", chunk)
+    for first, second in zip(evaluate(swarm, weights, SEEDS), expected, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+def test_entries_are_in_the_order_of_the_seeds(swarm, make_weights):
+    weights = make_weights(swarm)
+    backwards = evaluate(swarm, weights, SEEDS[::-1])
+    for first, second in zip(evaluate(swarm, weights, SEEDS), backwards, strict=True):
+        np.testing.assert_array_equal(first, second[::-1])
+    assert [len(column) for column in evaluate(swarm, weights, [])] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 5, 7, 20])
+@pytest.mark.parametrize("name", ["learned", *Baseline])
+def test_parts_give_the_whole_in_the_order_of_the_seeds(swarm, make_weights, name, parts):
+    spec = swarm._replace(world=dataclasses.replace(swarm.world, horizon_steps=100))
+    candidate = make_weights(spec) if name == "learned" else Baseline(name)
+    calls = LocalCalls()
+    seeds = SEEDS[::-1]
+    whole = evaluate(spec, candidate, seeds)
+    joined = evaluate_in_parts(calls, spec, calls.put(candidate), seeds, parts)
+    for first, second in zip(joined, whole, strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert len(set(whole.length_steps)) > 3  # or their order would not show
+
+
+def test_no_seeds_in_parts(swarm):
+    calls = LocalCalls()
+    none = evaluate_in_parts(calls, swarm, calls.put(Baseline.RANDOM), [], 4)
+    assert [len(column) for column in none] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("method", ["sensor", "in", "out"])
+def test_fl_orca_is_the_swarm_without_an_action(method):
+    world = WorldConfig(method=method, robots=4, groups=2, arena_radius_m=2.0, horizon_steps=300)
+    stats = evaluate(EnvSpec(ENV_ID, world), Baseline.FL_ORCA, SEEDS)
+    for i, seed in enumerate(SEEDS):
+        worlds = WorldBatch(world, 1)
+        worlds.seed([seed])
+        worlds.reset()
+        result = worlds.step(None)
+        while result.outcome[0] == Outcome.RUNNING:
+            result = worlds.step(None)
+        assert (stats.outcome[i], stats.length_steps[i]) == (result.outcome[0], result.steps[0])
+        assert stats.episode_return[i] == pytest.approx(result.episode_return[0], rel=1e-6)
+    assert len(set(stats.length_steps)) > 1
+
+
+@pytest.mark.parametrize("baseline", Baseline)
+@pytest.mark.parametrize("chunk", [1, 3])
+def test_a_baseline_does_not_depend_on_how_many_play_at_once(monkeypatch, swarm, baseline, chunk):
+    expected = evaluate(swarm, baseline, SEEDS)
+    monkeypatch.setattr(evaluator, "MAX_ENVS", chunk)
+    for first, second in zip(evaluate(swarm, baseline, SEEDS), expected, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("baseline", Baseline)
+def test_a_recorded_baseline_is_the_evaluated_one(swarm, baseline):
+    stats = evaluate(swarm, baseline, SEEDS)
+    for i, seed in enumerate(SEEDS):
+        episode = record_episode(swarm, baseline, seed)
+        assert (episode.outcome, len(episode.action)) == (stats.outcome[i], stats.length_steps[i] + 1)
+        assert ((episode.action[:-1] == -1) == (baseline is Baseline.FL_ORCA)).all()
+
+
+def test_a_baseline_in_an_environment_that_is_not_ours_is_refused(cart_pole):
+    with pytest.raises(ConfigError, match="random plays in our own environment only, not in CartPole-v1"):
+        evaluate(cart_pole, Baseline.RANDOM, SEEDS)
+
+
+def test_a_recorded_episode_is_the_evaluated_one(swarm, make_weights):
+    weights = make_weights(swarm, seed=5)
+    stats = evaluate(swarm, weights, SEEDS)
+    for i, seed in enumerate(SEEDS):
+        episode = record_episode(swarm, weights, seed)
+        assert (episode.outcome, episode.seed) == (stats.outcome[i], seed)
+        assert len(episode.action) == stats.length_steps[i] + 1
+        assert episode.reward.sum(dtype=np.float64) == pytest.approx(stats.episode_return[i], rel=1e-6)
+        assert episode.action[-1] == -1 and episode.reward[-1] == 0 and (episode.action[:-1] >= 0).all()
+
+
+def test_a_recorded_episode_holds_what_happened(swarm, make_weights):
+    episode = record_episode(swarm, make_weights(swarm), SEEDS[0])
+    worlds = SwarmEnv(**vars(swarm.world))
+    worlds.reset(seed=SEEDS[0])
+    for t, action in enumerate(episode.action):
+        np.testing.assert_array_equal(episode.position[t], worlds.worlds.positions()[0])
+        np.testing.assert_array_equal(episode.machine[t], worlds.worlds.state.machine[0])
+        np.testing.assert_array_equal(episode.velocity[t, :, 0], worlds.worlds.state.vel_x[0])
+        np.testing.assert_array_equal(episode.velocity[t, :, 1], worlds.worlds.state.vel_y[0])
+        if action >= 0:
+            assert worlds.step(action)[1] == episode.reward[t]
+    moved = np.diff(episode.position, axis=0)
+    step_s = swarm.world.time_step_s
+    np.testing.assert_allclose(moved, episode.velocity[1:] * step_s, atol=1e-5)
+    np.testing.assert_array_equal(episode.goal, worlds.worlds.goals()[0])
+    assert 0 <= episode.learner < swarm.world.num_robots
+
+
+def test_frames_of_an_environment_without_images(monkeypatch, cart_pole, make_weights):
+    def no_images(env_id, render_mode):
+        raise gym.error.UnsupportedMode(render_mode)
+
+    monkeypatch.setattr(gym, "make", no_images)
+    assert record_frames(cart_pole, make_weights(cart_pole), 1) == ([], 0.0)
+
+
+@pytest.mark.parametrize(("name", "rate"), [("cart_pole", 50), ("swarm", 20)])
+def test_frames_have_one_image_a_step(name, rate, request, make_weights):
+    spec = request.getfixturevalue(name)
+    weights = make_weights(spec)
+    frames, frames_per_s = record_frames(spec, weights, 4)
+    if not spec.is_swarm:  # gym.make knows nothing of the spec's world
+        assert len(frames) == evaluate(spec, weights, [4]).length_steps[0]
+    assert frames_per_s == rate
+    assert frames[0].dtype == np.uint8 and frames[0].ndim == 3

@@ -1,0 +1,61 @@
+"""The table of a sweep's results: written whole, read back as it was, refused where its counts cannot be."""
+
+import pytest
+
+from actors.evaluation.result_table import ResultRow, read_table, write_table
+from sim_core.checks import ConfigError
+from sim_core.outcomes import ENDED, Outcome
+
+ROW = ResultRow("thesis", "learned", "out", 5, 2, 1, 10, 2, 10, 4, 3, 2, 1, 0, 123.25, "0123456789ab")
+FIXED = ROW._replace(robots=5, seed=0)
+
+
+def test_what_is_written_is_read_in_a_fixed_order(tmp_path):
+    path = tmp_path / "new" / "results.csv"
+    write_table(path, [ROW, FIXED])
+    again = tmp_path / "again.csv"
+    write_table(again, [FIXED, ROW])
+    assert path.read_bytes() == again.read_bytes()
+    assert read_table(path) == [FIXED, ROW]
+    assert [file.name for file in path.parent.iterdir()] == ["results.csv"]
+
+
+def test_an_empty_table_is_a_table(tmp_path):
+    write_table(tmp_path / "results.csv", [])
+    assert read_table(tmp_path / "results.csv") == []
+
+
+def test_counts_go_by_outcome():
+    assert [ROW.count(kind) for kind in ENDED] == [4, 3, 2, 1, 0]
+    assert ROW.count(Outcome.CAPTURED) == 2
+    assert FIXED.is_fixed and not ROW.is_fixed and not FIXED._replace(groups=3).is_fixed
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("4,3,2,1,0 -> 5,3,2,1,0", "11 outcomes of 10"),
+        ("4,3,2,1,0 -> 9,-2,2,1,0", "outcomes of 10"),
+        ("4,3,2,1,0 -> four,3,2,1,0", "no row of results"),
+        ("4,3,2,1,0 -> 4,3,2,1", "no row of results"),
+        ("goal,lost -> lost,goal", "first line"),
+    ],
+)
+def test_a_table_that_cannot_be_is_refused(tmp_path, change, words):
+    path = tmp_path / "results.csv"
+    write_table(path, [ROW])
+    before, after = change.split(" -> ")
+    text = path.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after))
+    with pytest.raises(ConfigError, match=words):
+        read_table(path)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"\xff\xfe\x00", b"what,else\n1,2\n"])
+def test_what_is_no_table_is_refused(tmp_path, content):
+    path = tmp_path / "results.csv"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError, match=str(path)):
+        read_table(path)

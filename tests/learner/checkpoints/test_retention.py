@@ -1,0 +1,39 @@
+"""Which checkpoints stay."""
+
+import pytest
+
+from learner.checkpoints.retention import Scored, best_first, names_to_keep, score_at, scores_of
+from learner.tracking.journal import Row
+
+SCORES = [Scored(100, 0.2), Scored(200, 0.8), Scored(300, 0.8), Scored(400, 0.1)]
+CHECKPOINTS = [(f"at {env_steps}", env_steps) for env_steps in (450, 350, 250, 200, 99)]
+
+
+@pytest.mark.parametrize(
+    ("env_steps", "score"), [(99, None), (100, 0.2), (199, 0.2), (200, 0.8), (399, 0.8), (9999, 0.1)]
+)
+def test_a_checkpoints_score_is_the_last_evaluation_of_no_newer_weights(env_steps, score):
+    assert score_at(env_steps, SCORES) == score
+    assert score_at(env_steps, SCORES[::-1]) == score
+
+
+def test_evaluations_are_found_among_rows():
+    rows = [
+        Row(5, 0, {"train/loss": 1.0}),
+        Row(10, 0, {"eval/success_rate": 0.25, "eval/return": 3.0}),
+        Row(20, 0, {"eval/return": -3.0}),
+    ]
+    assert scores_of(rows) == [Scored(10, 0.25), Scored(20, -3.0)]
+
+
+def test_the_best_comes_first_of_two_alike_the_newer():
+    assert best_first(CHECKPOINTS, SCORES) == ["at 350", "at 250", "at 200", "at 450"]
+    assert best_first(CHECKPOINTS, []) == []
+
+
+@pytest.mark.parametrize(
+    ("newest", "best", "kept"),
+    [(1, 0, "450"), (1, 1, "450 350"), (2, 1, "450 350"), (1, 2, "450 350 250"), (9, 9, "450 350 250 200 99")],
+)
+def test_the_newest_and_the_best_stay(newest, best, kept):
+    assert names_to_keep(CHECKPOINTS, newest, best, SCORES) == {f"at {env_steps}" for env_steps in kept.split()}

@@ -1,0 +1,33 @@
+"""The log of faults: whole lines come back, half ones of killed drivers do not."""
+
+from actors.service.fault_policy import Action, Decision, Fault, Mended, Part, PartFailed, PartKind
+from learner.tracking.fault_log import FaultLog, read_faults
+
+WORKER = Part(PartKind.WORKER, 2)
+
+
+def test_events_come_back_in_order(tmp_path):
+    path = tmp_path / "run" / "faults.jsonl"
+    log = FaultLog(path)
+    log.failed(PartFailed(WORKER, 0, Fault.LATE, "silent"), Decision(Action.RESTART, 2))
+    log.mended(Mended(WORKER, Fault.LATE, Action.RESTART, 2, 1.5))
+    log.resumed()
+    entries = read_faults(path)
+    assert [entry[1:] for entry in entries] == [
+        ("failed", "rollout worker 2", "late", "restart", 2, 0.0),
+        ("mended", "rollout worker 2", "late", "restart", 2, 1.5),
+        ("resumed", "driver", "died", "resume", 1, 0.0),
+    ]
+    assert sorted(entry.time_s for entry in entries) == [entry.time_s for entry in entries]
+
+
+def test_half_a_line_does_not_count_nor_spoil_the_rest(tmp_path):
+    path = tmp_path / "faults.jsonl"
+    assert read_faults(path) == []
+    FaultLog(path).resumed()
+    whole = path.read_text()
+    path.write_text(whole + whole[:20])
+    assert len(read_faults(path)) == 1
+    FaultLog(path).resumed()  # its line stands behind the half one
+    FaultLog(path).resumed()
+    assert len(read_faults(path)) == 2

@@ -1,0 +1,67 @@
+"""The table of metrics: complete, in Prometheus' words, and the same on the operator's page."""
+
+import re
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from learner.config import RunConfig
+from learner.loop import TrainingLoop
+from learner.tracking.journal import Journal
+from learner.tracking.metric_names import ENV_STEPS, METRICS
+from learner.training.cluster import process_cluster
+from tests.checkpointing import Silent
+
+PAGE = Path(__file__).parents[3] / "deploy" / "README.md"
+
+
+def journal_names(config: RunConfig, folder: Path) -> set[str]:
+    """Names of all metrics that a run in one process leaves in its journal."""
+    with closing(Journal(folder / "metrics.jsonl", 0)) as journal:
+        loop = TrainingLoop(config, process_cluster(config, 0), journal, folder / "checkpoints", Silent(), bool)
+        assert loop.run()
+        return {name for row in journal.rows() for name in row.metrics}
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory, small_run):
+    """What runs of our environment and of one without outcomes measure together."""
+    plain = dict(
+        engine="process",
+        total_env_steps=2_000,
+        envs_per_worker=4,
+        min_replay=100,
+        batch_size=16,
+        hidden_sizes=(8,),
+        log_every_env_steps=500,
+        eval_every_env_steps=500,
+        eval_episodes=2,
+    )
+    ours = RunConfig(world=small_run.world, **plain)
+    other = RunConfig(env_id="CartPole-v1", **plain)
+    return journal_names(ours, tmp_path_factory.mktemp("ours")) | journal_names(other, tmp_path_factory.mktemp("other"))
+
+
+def test_the_table_has_every_metric_of_the_journal_and_no_other(written):
+    assert {known.journal for known in METRICS} - {ENV_STEPS} == written
+
+
+def test_names_are_prometheus_names_and_stand_once():
+    for of in ("journal", "name", "series"):
+        assert len({getattr(known, of) for known in METRICS}) == len(METRICS)
+    for known in METRICS:
+        assert re.fullmatch(r"shoal_[a-z_]+[a-z]", known.name)
+        text = f"# TYPE {known.series} {known.kind}\n{known.series} 1\n"
+        (family,) = text_string_to_metric_families(text)
+        assert (family.type, [sample.name for sample in family.samples]) == (known.kind, [known.series])
+        assert not known.name.endswith("_total"), "Ray appends it to counters"
+        assert (known.unit + known.meaning).isascii(), "Ray's descriptions are ASCII"
+
+
+def test_the_operators_page_has_the_table():
+    lines = PAGE.read_text().splitlines()
+    start = lines.index("| metric | unit | meaning | healthy | in the journal |") + 2
+    rows = [f"| `{m.series}` | {m.unit} | {m.meaning} | {m.healthy} | `{m.journal}` |" for m in METRICS]
+    assert lines[start : start + len(rows) + 1] == [*rows, ""]

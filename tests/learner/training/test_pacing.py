@@ -1,0 +1,211 @@
+"""Pacing under every order of events: it never deadlocks, never leaves its band, and reaches its ratio."""
+
+import math
+import random
+from typing import NamedTuple
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from learner.config import RunConfig
+from learner.training.pacing import Pacer, PacingState, make_pacer
+
+
+class Setup(NamedTuple):
+    """Arguments of Pacer."""
+
+    samples_per_insert: float
+    min_replay: int
+    batch_size: int
+    updates_per_call: int
+    block_rows: int
+    blocks_in_flight: int
+
+
+setups = st.builds(
+    Setup,
+    samples_per_insert=st.sampled_from([0.01, 0.3, 1.0, 4.0, 33.3]),
+    min_replay=st.sampled_from([1, 50, 1000]),
+    batch_size=st.sampled_from([1, 32, 256]),
+    updates_per_call=st.sampled_from([1, 8, 64]),
+    block_rows=st.sampled_from([1, 16, 700]),
+    blocks_in_flight=st.integers(1, 9),
+)
+
+
+def band(setup):
+    """(lowest, highest) of inserted x samples_per_insert - sampled, once sampling has begun."""
+    call = setup.batch_size * setup.updates_per_call
+    start = setup.min_replay * setup.samples_per_insert
+    return start - call, start + 2 * call + setup.blocks_in_flight * setup.block_rows * setup.samples_per_insert
+
+
+def start_all(pacer, setup, under_way, calls):
+    """Starts whatever the pacer allows, as the training loop does."""
+    while under_way.count("block") < setup.blocks_in_flight and pacer.may_collect(under_way.count("block")):
+        under_way.append("block")
+    while under_way.count("update") < calls and (updates := pacer.updates_due()):
+        assert updates == setup.updates_per_call
+        assert pacer.state.inserted >= setup.min_replay
+        pacer.sampling(updates)
+        under_way.append("update")
+
+
+def simulate(setup, calls, seed, events, short=True, loss=0.0):
+    """Ends one random call under way at a time; the pacer after `events` of them.
+
+    With probability `loss` an event also loses a random share of the replay, and updates then fail.
+    """
+    pacer, rng, under_way = Pacer(*setup), random.Random(seed), []
+    lowest, highest = band(setup)
+    for _ in range(events):
+        start_all(pacer, setup, under_way, calls)
+        assert under_way, "deadlock"
+        kind = under_way.pop(rng.randrange(len(under_way)))
+        if kind == "block":  # the first blocks hold fewer rows (n-step), a duplicate none
+            pacer.inserted(rng.choice([setup.block_rows, setup.block_rows - 1, 0]) if short else setup.block_rows)
+        if rng.random() < loss:
+            before = pacer.state
+            pacer.lost(rng.choice([0.1, 0.5, 1.0]))
+            assert pacer.state.written_off >= before.written_off
+            if "update" in under_way:
+                under_way.remove("update")
+                pacer.not_sampled(setup.updates_per_call)
+        ahead = pacer.state.inserted * setup.samples_per_insert - pacer.state.sampled - pacer.state.written_off
+        assert ahead <= highest + (calls * setup.batch_size * setup.updates_per_call if loss else 0) + 1e-6
+        assert loss or ahead >= lowest - 1e-6 or not pacer.state.sampled
+        assert not pacer.state.sampled or pacer.state.inserted >= setup.min_replay
+    return pacer
+
+
+@given(setup=setups, calls=st.integers(1, 3), seed=st.integers(0, 999))
+@settings(max_examples=100, deadline=None)
+def test_losses_do_not_deadlock(setup, calls, seed):
+    simulate(setup, calls, seed, 300, loss=0.1)
+
+
+def test_after_the_loss_of_all_the_replay_fills_up_as_at_the_start():
+    pacer = Pacer(*Setup(2.0, 100, 10, 5, 20, 2))
+    for _ in range(9):
+        pacer.inserted(20)
+    while pacer.updates_due():
+        pacer.sampling(5)
+    pacer.lost(1.0)
+    held = 0
+    while not pacer.updates_due():
+        assert pacer.may_collect(0)
+        pacer.inserted(20)
+        held += 20
+    assert held == 100  # min_replay
+
+
+def test_new_transitions_are_sampled_as_often_whatever_was_lost():
+    """What is inserted after a loss gets samples_per_insert samples; what was lost is not made up for."""
+    pacer = Pacer(*Setup(2.0, 100, 10, 1, 20, 1))
+    lost_at = {40: 1.0, 80: 0.5}
+    sampled = {}
+    for i in range(2_000):
+        if i in lost_at:
+            pacer.lost(lost_at[i])
+        pacer.inserted(20)
+        while pacer.updates_due():
+            pacer.sampling(1)
+        sampled[i] = pacer.state.sampled
+    assert (sampled[1_999] - sampled[999]) / (1_000 * 20) == pytest.approx(2.0, rel=1e-3)
+    assert pacer.ratio() < 2.0
+
+
+def test_updates_that_could_not_be_made_are_taken_back():
+    pacer = Pacer(*Setup(4.0, 1, 8, 1, 8, 1))
+    pacer.inserted(8)
+    before = pacer.state
+    pacer.sampling(3)
+    pacer.not_sampled(3)
+    assert pacer.state == before
+
+
+@given(setup=setups, calls=st.integers(1, 3), seed=st.integers(0, 999))
+@settings(max_examples=150, deadline=None)
+def test_never_deadlocks_nor_leaves_its_band(setup, calls, seed):
+    simulate(setup, calls, seed, 300)
+
+
+@given(calls=st.integers(1, 2), seed=st.integers(0, 99), ratio=st.sampled_from([0.3, 1.0, 4.0]))
+@settings(max_examples=30, deadline=None)
+def test_the_ratio_converges_within_the_band(calls, seed, ratio):
+    setup = Setup(ratio, 100, 32, 4, 64, 3)
+    pacer = simulate(setup, calls, seed, 3000)
+    lowest, highest = band(setup)
+    state = pacer.state
+    assert state.sampled > 20 * max(abs(lowest), highest)  # both sides went on
+    assert ratio - highest / state.inserted - 1e-9 <= pacer.ratio() <= ratio - lowest / state.inserted + 1e-9
+    assert pacer.ratio() == pytest.approx(ratio, rel=0.06)
+
+
+def test_a_stalled_learner_stops_the_workers_and_the_other_way_round():
+    setup = Setup(2.0, 100, 10, 5, 20, 2)
+    pacer = Pacer(*setup)
+    while pacer.may_collect(0):
+        pacer.inserted(20)
+    # 2 x inserted must stay within 200 + 2 x 50 + 2 x 20 x 2 = 380.
+    assert pacer.state.inserted == 180
+    calls = 0
+    while pacer.updates_due():
+        pacer.sampling(5)
+        calls += 1
+    assert calls == 4 and pacer.state.sampled == 200  # 360 - 200 = 160 is below 200
+
+
+def test_nothing_is_sampled_before_the_start_size():
+    pacer = Pacer(*Setup(4.0, 100, 1, 1, 1, 1))
+    pacer.inserted(99)
+    assert pacer.updates_due() == 0
+    pacer.inserted(1)
+    assert pacer.updates_due() == 1
+
+
+def test_blocks_under_way_count_as_inserted():
+    pacer = Pacer(*Setup(1.0, 10, 1, 1, 10, 3))  # at most 10 + 2 + 30 = 42
+    assert [pacer.may_collect(under_way) for under_way in range(5)] == [True, True, True, True, False]
+    pacer.inserted(10)
+    assert [pacer.may_collect(under_way) for under_way in range(4)] == [True, True, True, False]
+
+
+@given(setup=setups, seed=st.integers(0, 99))
+@settings(max_examples=30, deadline=None)
+def test_a_saved_state_decides_the_same(setup, seed):
+    pacer = simulate(setup, 1, seed, 60)
+    pacer.waited(to_insert=True)
+    pacer.waited(to_insert=False)
+    pacer.waited(to_insert=False)
+    resumed = Pacer(*setup)
+    resumed.state = PacingState(**pacer.state._asdict())
+    assert resumed.state == pacer.state and pacer.state[2:4] == (1, 2)
+    for _ in range(30):
+        assert resumed.updates_due() == pacer.updates_due()
+        assert [resumed.may_collect(i) for i in range(4)] == [pacer.may_collect(i) for i in range(4)]
+        for one in (pacer, resumed):
+            one.sampling(one.updates_due())
+            one.inserted(setup.block_rows)
+
+
+def test_the_ratio_is_unknown_before_the_first_insert():
+    pacer = Pacer(*Setup(4.0, 1, 8, 1, 8, 1))
+    assert math.isnan(pacer.ratio())
+    pacer.inserted(8)
+    pacer.sampling(3)
+    assert pacer.ratio() == 3.0
+
+
+@pytest.mark.parametrize("name", Setup._fields)
+@pytest.mark.parametrize("value", [0, -1])
+def test_numbers_that_would_deadlock_are_refused(name, value):
+    with pytest.raises(ValueError, match="positive"):
+        Pacer(*Setup(4.0, 100, 32, 4, 64, 3)._replace(**{name: value}))
+
+
+def test_the_pacer_of_a_run():
+    config = RunConfig(envs_per_worker=4, steps_per_block=5, min_replay=40, batch_size=8, updates_per_call=3)
+    pacer, same = make_pacer(config, 2), Pacer(config.samples_per_insert, 40, 8, 3, 20, 2)
+    assert vars(pacer) == vars(same)

@@ -1,0 +1,102 @@
+"""Compiled updates are those of PyTorch's autograd and Adam, whatever the network's shape and the options."""
+
+import numpy as np
+import pytest
+import torch
+
+from actors.policy.network import QNetwork
+from learner.update.compiled_updates import CompiledUpdates
+from learner.update.gradients import FlatNetwork
+from learner.update.updates import TorchUpdates
+
+SHAPES = [((16,), (64, 64), 8, 64), ((72,), (256, 256), 9, 32), ((3,), (5,), 2, 1), ((2, 4), (7, 6, 5), 4, 33)]
+RATE = 1e-3
+
+
+def maker(ways, settings):
+    """(updates by `ways`, online network, target network, optimiser), the same at every call."""
+    torch.manual_seed(0)
+    sizes = (settings.observation_size, settings.hidden_sizes, settings.num_actions)
+    online, target = FlatNetwork(QNetwork(*sizes)), FlatNetwork(QNetwork(*sizes))
+    optimiser = torch.optim.Adam([online.values], fused=True)
+    return ways(online, target, optimiser, settings), online, target, optimiser
+
+
+def columns_of(count, shape, num_actions, seed=0, weighted=False):
+    rng = np.random.default_rng(seed)
+    found = {
+        "observation": rng.normal(size=(count, *shape)),
+        "next_observation": rng.normal(size=(count, *shape)),
+        "reward": rng.normal(scale=2, size=count),  # TD errors on both sides of Huber's corner
+        "discount": rng.choice([0.0, 0.97], size=count),
+    }
+    if weighted:
+        found["weight"] = rng.uniform(0.1, 1.0, size=count)
+    tensors = {name: torch.from_numpy(array.astype(np.float32)) for name, array in found.items()}
+    return tensors | {"action": torch.from_numpy(rng.integers(num_actions, size=count))}
+
+
+def settings_of(learner_settings, shape, hidden_sizes, num_actions, batch_size, **others):
+    return learner_settings._replace(
+        observation_size=int(np.prod(shape)),
+        hidden_sizes=hidden_sizes,
+        num_actions=num_actions,
+        batch_size=batch_size,
+        gradients="autograd",
+        **others,
+    )
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("options", [{}, {"loss": "mse"}, {"soft_target_rate": 0.1}, {"max_gradient_norm": 100.0}])
+@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize(("shape", "hidden_sizes", "num_actions", "size"), SHAPES)
+def test_an_update_is_that_of_autograd(
+    learner_settings, shape, hidden_sizes, num_actions, size, double, options, weighted
+):
+    settings = settings_of(learner_settings, shape, hidden_sizes, num_actions, size, double=double, **options)
+    compiled, online, target, optimiser = maker(CompiledUpdates, settings)
+    plain, other_online, other_target, other_optimiser = maker(TorchUpdates, settings)
+    columns = columns_of(5 * size, shape, num_actions, weighted=weighted)
+    stats, errors = compiled(columns, RATE, 7)
+    expected, expected_errors = plain(columns, RATE, 7)
+    np.testing.assert_allclose(stats, expected, rtol=2e-5, atol=2e-6)
+    np.testing.assert_allclose(errors, expected_errors, rtol=2e-5, atol=2e-5)
+    scale = float(other_online.values.grad.abs().max())
+    assert scale > 1e-4
+    torch.testing.assert_close(online.values.grad, other_online.values.grad, rtol=1e-3, atol=1e-5 * scale)
+    state, other_state = optimiser.state[online.values], other_optimiser.state[other_online.values]
+    assert float(state["step"]) == float(other_state["step"]) == 5
+    for name in ("exp_avg", "exp_avg_sq"):
+        largest = float(other_state[name].abs().max())
+        torch.testing.assert_close(state[name], other_state[name], rtol=1e-3, atol=1e-5 * largest)
+    for flat, other in ((online, other_online), (target, other_target)):
+        apart = (flat.values - other.values).detach().abs().mean()
+        assert float(apart) < 1e-3 * RATE  # Adam's step of a gradient of nearly nothing may be of either sign
+
+
+@pytest.mark.parametrize("change", [torch.nan, torch.inf])
+def test_what_diverged_shows(learner_settings, change):
+    compiled, online, _, _ = maker(CompiledUpdates, settings_of(learner_settings, (6,), (8, 8), 3, 16))
+    columns = columns_of(16, (6,), 3)
+    columns["reward"][3] = change
+    stats, errors = compiled(columns, RATE, 0)
+    assert not np.isfinite(stats.loss) and not np.isfinite(errors[3])
+    assert np.isfinite(errors[[0, 1, 2]]).all()
+    if np.isnan(change):
+        assert online.values.detach().isnan().all()
+
+
+def test_ties_are_broken_as_by_pytorch(learner_settings):
+    settings = settings_of(learner_settings, (6,), (8,), 3, 16)
+    compiled, online, target, _ = maker(CompiledUpdates, settings)
+    plain, other, _, _ = maker(TorchUpdates, settings)
+    for network in (online, other):
+        network.values.data.zero_()  # every action is worth as much; the target network tells them apart
+    columns = columns_of(16, (6,), 3)
+    errors = compiled(columns, RATE, 0)[1]
+    np.testing.assert_allclose(errors, plain(columns, RATE, 0)[1], rtol=1e-5, atol=1e-6)
+    values = target.network(columns["next_observation"])
+    assert np.ptp(values.detach().numpy(), axis=1).min() > 1e-3
+    goals = columns["reward"] + columns["discount"] * values[:, 0]
+    np.testing.assert_allclose(errors, goals.detach().numpy(), rtol=1e-5, atol=1e-6)

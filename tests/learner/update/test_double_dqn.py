@@ -1,0 +1,138 @@
+"""Targets and loss against hand-computed numbers and brute force."""
+
+import numpy as np
+import pytest
+import torch
+
+from learner.update.double_dqn import as_batch, double_q_target, importance_weights, mean_loss, q_target, targets
+
+# Row 0: both networks prefer action 1. Row 1: online prefers 0, target 2 - there the algorithms differ.
+ONLINE = torch.tensor([[1.0, 3.0, 2.0], [5.0, 4.0, 1.0]])
+TARGET = torch.tensor([[10.0, 30.0, 20.0], [-1.0, 2.0, 8.0]])
+REWARD, DISCOUNT = torch.tensor([0.5, -1.0]), torch.tensor([0.9, 0.5])
+
+
+def test_double_dqn_by_hand():
+    expected = [0.5 + 0.9 * 30, -1.0 + 0.5 * -1.0]
+    assert double_q_target(ONLINE, TARGET, REWARD, DISCOUNT).tolist() == pytest.approx(expected)
+
+
+def test_dqn_by_hand():
+    expected = [0.5 + 0.9 * 30, -1.0 + 0.5 * 8.0]
+    assert q_target(TARGET, REWARD, DISCOUNT).tolist() == pytest.approx(expected)
+
+
+def test_they_agree_exactly_where_both_networks_prefer_the_same():
+    equal = double_q_target(ONLINE, TARGET, REWARD, DISCOUNT) == q_target(TARGET, REWARD, DISCOUNT)
+    assert equal.tolist() == [True, False]
+    assert torch.equal(double_q_target(TARGET, TARGET, REWARD, DISCOUNT), q_target(TARGET, REWARD, DISCOUNT))
+
+
+def test_a_discount_of_0_leaves_the_reward():
+    zero = torch.zeros(2)
+    assert torch.equal(double_q_target(ONLINE, TARGET, REWARD, zero), REWARD)
+    assert torch.equal(q_target(TARGET, REWARD, zero), REWARD)
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_targets_equal_a_loop(make_rows, double):
+    rows = make_rows(40, seed=1)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        online, target = torch.nn.Linear(3, 4), torch.nn.Linear(3, 4)
+    values = [
+        rows["next_observation"] @ net.weight.detach().numpy().T + net.bias.detach().numpy() for net in (online, target)
+    ]
+    expected = []
+    for i, row in enumerate(rows):
+        best = max(range(4), key=lambda a, i=i: values[0 if double else 1][i][a])
+        expected.append(row["reward"] + row["discount"] * values[1][i][best])
+    batch = as_batch({name: torch.from_numpy(rows[name].astype(np.float32)) for name in rows.dtype.names}, slice(0, 40))
+    result = targets(batch, online, target, double)
+    np.testing.assert_allclose(result.numpy(), expected, rtol=1e-5, atol=1e-5)
+    assert not result.requires_grad
+
+
+def test_loss_is_the_mean_mean_loss_of_the_taken_actions():
+    q_tm1 = torch.tensor([[0.0, 9.0], [9.0, 1.0], [2.0, 9.0]])
+    target = torch.tensor([0.5, 4.0, -0.25])
+    loss, td_error = mean_loss(q_tm1, torch.tensor([0, 1, 0]), target)
+    assert td_error.tolist() == [0.5, 3.0, -2.25]
+    assert loss.item() == pytest.approx((0.5 * 0.25 + (3.0 - 0.5) + (2.25 - 0.5)) / 3)
+
+
+def test_mean_square_of_the_taken_actions_errors_by_hand():
+    q_tm1 = torch.tensor([[0.0, 9.0], [9.0, 1.0]])
+    target, weight = torch.tensor([0.5, 4.0]), torch.tensor([1.0, 0.1])
+    assert mean_loss(q_tm1, torch.tensor([0, 1]), target, "mse")[0].item() == pytest.approx((0.25 + 9) / 2)
+    assert mean_loss(q_tm1, torch.tensor([0, 1]), target, "mse", weight)[0].item() == pytest.approx((0.25 + 0.9) / 2)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("name", ["huber", "mse"])
+def test_loss_and_gradient_equal_the_closed_form(name, weighted):
+    rng = np.random.default_rng(0)
+    errors = np.concatenate([rng.normal(scale=2, size=200), [1.0, -1.0, 0.0, 0.999, -1.001]])
+    weights = rng.uniform(0.1, 1.0, len(errors)) if weighted else np.ones(len(errors))
+    q_tm1 = torch.zeros((len(errors), 2), requires_grad=True)
+    actions, target = torch.ones(len(errors), dtype=torch.int64), torch.from_numpy(errors).float()
+    loss, _ = mean_loss(q_tm1, actions, target, name, torch.from_numpy(weights).float() if weighted else None)
+    size = np.abs(errors)
+    losses = np.where(size <= 1, errors**2 / 2, size - 0.5) if name == "huber" else errors**2
+    slopes = errors.clip(-1, 1) if name == "huber" else 2 * errors
+    assert loss.item() == pytest.approx((weights * losses).mean(), rel=1e-5)
+    loss.backward()
+    np.testing.assert_allclose(q_tm1.grad[:, 1], -weights * slopes / len(errors), rtol=1e-5, atol=1e-9)
+    assert not q_tm1.grad[:, 0].any()
+
+
+def test_importance_weights_by_hand():
+    """Four stored transitions, minibatches of two: 1 / (4 P) to the power of beta, over the minibatch's greatest."""
+    weights = importance_weights(np.array([0.5, 0.25, 0.125, 0.125]), 2, 0.5)
+    assert weights.dtype == np.float32
+    assert weights.tolist() == pytest.approx([2**-0.5, 1, 1, 1])
+    np.testing.assert_array_equal(importance_weights(np.array([0.5, 0.25]), 2, 0.0), [1, 1])
+
+
+def test_importance_weights_are_the_papers():
+    rng = np.random.default_rng(0)
+    stored = rng.uniform(0.01, 1.0, 1000)
+    stored /= stored.sum()
+    for exponent in (0.4, 1.0):
+        drawn = rng.choice(stored, size=(5, 32))
+        expected = (1 / len(stored) / drawn) ** exponent
+        expected /= expected.max(axis=1, keepdims=True)
+        np.testing.assert_allclose(importance_weights(drawn.ravel(), 32, exponent).reshape(5, 32), expected, rtol=1e-6)
+
+
+def test_whole_importance_weights_take_all_of_the_bias_away():
+    """beta = 1: the weighted mean over prioritised draws is the plain mean over all that is stored."""
+    rng = np.random.default_rng(1)
+    values = rng.normal(size=50)
+    shares = (values.max() - values + 0.2) / (values.max() - values + 0.2).sum()
+    drawn = rng.choice(50, p=shares, size=200_000)
+    weights = importance_weights(shares[drawn], 200_000, 1.0).astype(float)
+    spread = values[drawn] * weights
+    error = 4 * spread.std() / np.sqrt(200_000) / weights.mean()
+    assert spread.mean() / weights.mean() == pytest.approx(values.mean(), abs=error)
+    assert abs(values[drawn].mean() - values.mean()) > 5 * error  # or nothing would be tested
+
+
+def test_no_gradient_flows_into_the_target():
+    online, target = torch.ones((2, 2), requires_grad=True), torch.zeros(2, requires_grad=True)
+    loss, td_error = mean_loss(online, torch.tensor([0, 1]), target * 3)
+    loss.backward()
+    assert target.grad is None and online.grad is not None
+    assert not td_error.requires_grad
+
+
+def test_a_minibatch_is_its_slice(make_rows):
+    columns = {name: torch.from_numpy(make_rows(10)[name].copy()) for name in make_rows(10).dtype.names}
+    batch = as_batch(columns, slice(4, 7))
+    rows = make_rows(10)[4:7]
+    names = ("observation", "action", "reward", "discount", "next_observation")
+    for tensor, name in zip(batch[:5], names, strict=True):
+        np.testing.assert_array_equal(tensor.numpy(), rows[name])
+    assert batch.weight is None
+    columns["weight"] = torch.arange(10.0)
+    assert as_batch(columns, slice(4, 7)).weight.tolist() == [4.0, 5.0, 6.0]
