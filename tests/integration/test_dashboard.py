@@ -14,7 +14,6 @@ from contextlib import closing, contextmanager
 import mlflow
 import numpy as np
 import pytest
-from tests.dashboards.test_web_report import requested
 
 from actors.evaluation.evaluator import record_episode
 from actors.evaluation.result_table import read_table, write_table
@@ -32,6 +31,7 @@ from learner.tracking.journal import Journal, read_rows
 from learner.tracking.mlflow_run import Tracker
 from learner.training.cluster import process_cluster
 from tests.dashboards.chromium import complaints, open_chromium, wait_until
+from tests.dashboards.pages.test_report_page import requested
 from tests.integration.conftest import SMALL, clean_environment
 from tests.integration.test_process_run import Silent
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import zarr
 
-from actors import evaluation_store, storage
+from actors.evaluation import evaluation_store
 from actors.evaluation.evaluation_store import StoredEvaluation, load_evaluation, save_evaluation
 from actors.rollout.vector_env import EnvSpec
 from actors.service.messages import EpisodeStats
+from actors.storage import zarr_columns as storage
 from sim_core import ENV_ID
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors import frame_ring, packing
+from actors.replay import frame_ring
 from actors.replay.frame_ring import FrameRing
+from actors.service import packing
 from actors.storage.zarr_columns import load_rows, save_rows
 
 OBSERVATION = np.dtype((np.int16, (2,)))

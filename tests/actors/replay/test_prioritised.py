@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
-from tests.actors.test_replay import DTYPE, make_block
 
 from actors.replay.prioritised import SMALLEST, PrioritisedShard, PrioritySettings
 from actors.replay.shard import ReplayShard
+from tests.actors.replay.test_shard import DTYPE, make_block
 from tests.packed import as_rows
 
 ALPHA = 0.6

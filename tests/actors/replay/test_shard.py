@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from actors import frame_ring, packing
+from actors.replay import frame_ring
 from actors.replay.shard import ReplayShard, Stored
 from actors.rollout.worker import join_stats
+from actors.service import packing
 from actors.service.messages import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
 from actors.storage.zarr_columns import save_rows
 from tests.packed import as_rows, pack

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from actors.replay.node import ShardNode, ShardSettings
+from actors.rollout import node as rollout_node
 from actors.rollout.node import RolloutNode
 from actors.rollout.vector_env import env_shape
 from actors.rollout.worker import RolloutSettings, RolloutWorker
-from actors.rollout.worker import node as rollout_node
 from actors.service.fault_policy import CallFailed, Fault
 from actors.service.messages import Delivered, Dropped, transition_dtype
 from actors.service.rpc import LocalCalls

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from actors.storage.zarr_columns import malloc as memory
+from actors.storage import malloc as memory
 
 pytestmark = pytest.mark.skipif(memory._trim is None, reason="a C library other than glibc")
 

@@ -12,7 +12,7 @@ from actors.replay.shard import ReplayShard
 from actors.rollout.worker import join_stats
 from actors.service.messages import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
 from actors.service.packing import packed_dtype
-from actors.storage.zarr_columns import ring_snapshot
+from actors.storage import ring_snapshot
 from tests.packed import pack
 
 DTYPE = transition_dtype(gym.spaces.Box(-127, 127, (3,), np.int8))

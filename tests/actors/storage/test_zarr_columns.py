@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import zarr
 
+from actors.storage import zarr_columns as storage
 from actors.storage.zarr_columns import load_rows, save_rows
-from actors.storage.zarr_columns import zarr_columns as storage
 
 DTYPE = np.dtype([("reward", "f4"), ("action", "i4"), ("observation", "i1", (2, 3))], align=True)
 

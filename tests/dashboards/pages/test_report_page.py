@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.dashboards.test_charts import TRAININGS, counted
 
 from actors.evaluation.trajectory import Episode
 from dashboards.analysis.aggregate import GROUPS, METHOD_NAMES, ROBOTS, Results, Setup
@@ -20,6 +19,7 @@ from dashboards.plotly_charts.run_charts import setup_curves, sweep_speeds
 from sim_core.config import WorldConfig
 from tests.dashboards.chromium import complaints, emulate_scheme, emulate_width, press, two_frames, wait_until
 from tests.dashboards.contrast import poor_texts
+from tests.dashboards.plotly_charts.test_charts import TRAININGS, counted
 from tests.dashboards.tables import claimed_table, row
 
 EVIL = "</script><b>&{{data}}"

@@ -8,12 +8,12 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from tests.learner.test_onboard import lively
 
 from actors.policy.baselines import Baseline
 from actors.policy.network import QNetwork, snapshot
 from actors.rollout.vector_env import env_shape
 from learner.config import RunConfig
+from learner.export import write as export
 from learner.export.ports import bare_inputs, bare_outputs, robot_inputs, robot_outputs
 from learner.export.reference_states import observed_states, swarm_states
 from learner.export.robot_policy import BarePolicy, make_robot
@@ -31,10 +31,10 @@ from learner.export.write import (
     run_program,
     write_export,
 )
-from learner.export.write import write as export
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 from sim_core.methods import make_method
+from tests.learner.export.test_robot_policy import lively
 
 WORLDS = {
     "sensor": WorldConfig(robots=5, groups=3),

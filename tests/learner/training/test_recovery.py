@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from actors.replay.node import ShardNode
+from actors.rollout import node as rollout_node
 from actors.rollout.node import RolloutNode
-from actors.rollout.worker import node as rollout_node
 from actors.service.fault_policy import Action, Fault, PartKind, Recovery, RunFailed
 from learner.checkpoints.checkpoint import newest_valid
 from learner.checkpoints.writer import Checkpointer

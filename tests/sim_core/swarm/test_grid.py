@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.sim_core.test_neighbours import brute_force
 
-from sim_core import step, tile
 from sim_core.config import WorldConfig
 from sim_core.lanes import LANES
+from sim_core.swarm import step, tile
 from sim_core.swarm.grid import ROW_SPAN_CELLS
 from sim_core.worlds import WorldBatch
 from tests.sim_core.kernels import arranged, orca_step
+from tests.sim_core.swarm.test_neighbours import brute_force
 
 REAL = np.float32
 SIZES = (1, 2, 7, 8, 9, 40, 203, 600)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.sim_core.test_neighbours import brute_force
 
 from sim_core.config import WorldConfig
 from sim_core.worlds import WorldBatch
 from tests.sim_core.kernels import orca_step
+from tests.sim_core.swarm.test_neighbours import brute_force
 
 REAL = np.float32
 
