@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from actors.evaluation.result_table import LEARNED, ResultRow
-from dashboards.analysis.aggregate import METHOD_NAMES, NUM_CELLS, SETUPS, Results, Setup, success
+from dashboards.analysis.aggregate import CELLS_PER_METHOD, SETUPS, Results, Setup, success
 from dashboards.analysis.claim_checks import Claim, Verdict, with_verdict
 from dashboards.analysis.claim_text import NOTE, table_of, tally, verdict_table
+from dashboards.analysis.methods import in_order, method_label
 from dashboards.figures.diagrams import DIAGRAMS
 from dashboards.figures.example_episodes import EXAMPLES
 from dashboards.figures.result_figures import PICTURES
@@ -83,7 +84,14 @@ def _verdict_in_short(claim: Claim) -> str:
 
 
 def _coverage(parts: Sequence[PresetPart]) -> list[str]:
-    header = ("preset", f"Fixed cells of {NUM_CELLS}", "Extrapolation cells", "training seeds a cell", "episodes")
+    methods = in_order(method for part in parts for method in part.results.methods())
+    header = (
+        "preset",
+        f"Fixed cells of {CELLS_PER_METHOD * len(methods)}",
+        "Extrapolation cells",
+        "training seeds a cell",
+        "episodes",
+    )
     return table_of(header, [_coverage_row(part) for part in parts])
 
 
@@ -91,7 +99,7 @@ def _coverage_row(part: PresetPart) -> tuple[str, ...]:
     cells = part.results.cells()
     seeds = sorted({len(cell.rows) for cell in cells})
     span = f"{seeds[0]}" if len(seeds) == 1 else f"{seeds[0]} … {seeds[-1]}"
-    fixed = sum(len(part.results.fixed_present(method)) for method in METHOD_NAMES)
+    fixed = sum(len(part.results.fixed_present(method)) for method in part.results.methods())
     transferred = sum(not cell.rows[0].is_fixed for cell in cells)
     episodes = sum(cell.episodes for cell in cells)
     return part.name, str(fixed), str(transferred), span, f"{episodes:,}"
@@ -119,13 +127,14 @@ def comparison_rows(rivals: dict[str, Results]) -> tuple[list[str], list[list[st
     `best in` counts the setups in which a rival has a higher rate than every other.
     """
     header = ["method", "setups in all", *rivals, *(f"{name} best in" for name in rivals)]
-    return header, [_comparison_row(list(rivals.values()), method) for method in METHOD_NAMES]
+    methods = in_order(method for results in rivals.values() for method in results.methods())
+    return header, [_comparison_row(list(rivals.values()), method) for method in methods]
 
 
 def _comparison_row(rivals: list[Results], method: str) -> list[str]:
     shared = [setup for setup in SETUPS if all(results.fixed(method, setup) is not None for results in rivals)]
     if not shared:
-        return [METHOD_NAMES[method], "0", *["–"] * (2 * len(rivals))]
+        return [method_label(method), "0", *["–"] * (2 * len(rivals))]
     rates = [[_success(results, method, setup) for setup in shared] for results in rivals]
     means = [f"{100 * sum(line) / len(line):.1f} %" for line in rates]
     wins = [0] * len(rivals)
@@ -133,7 +142,7 @@ def _comparison_row(rivals: list[Results], method: str) -> list[str]:
         best = max(column)
         if column.count(best) == 1:
             wins[column.index(best)] += 1
-    return [METHOD_NAMES[method], str(len(shared)), *means, *map(str, wins)]
+    return [method_label(method), str(len(shared)), *means, *map(str, wins)]
 
 
 def _success(results: Results, method: str, setup: Setup) -> float:

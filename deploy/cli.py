@@ -23,7 +23,6 @@ from learner.config import RunConfig, from_dict  # noqa: E402
 from learner.presets import PresetName, preset_config  # noqa: E402
 from learner.ray_backend.auth import guard_ray  # noqa: E402
 from sim_core.checks import ConfigError, require  # noqa: E402
-from sim_core.config import MethodName  # noqa: E402
 
 FAILED = 1
 BAD_INPUT = 2
@@ -70,8 +69,8 @@ def _train_defaults(arguments: Sequence[str]) -> Train:
     if path is not None:
         require(preset is None, "--config and --preset both give all settings; leave one of them out")
         return Train(config=Path(path), run=read_config_file(Path(path)))
-    if preset in get_args(PresetName) and (method or "sensor") in get_args(MethodName):  # else tyro tells the choices
-        return Train(run=preset_config(cast(PresetName, preset), cast(MethodName, method or "sensor")))
+    if preset in get_args(PresetName):  # else tyro tells the choices
+        return Train(run=preset_config(cast(PresetName, preset), method or "sensor"))
     return Train()
 
 

@@ -14,6 +14,7 @@ from actors.rollout.vector_env import EnvSpec
 from sim_core import ENV_ID
 from sim_core.checks import ConfigError, check_fields, require
 from sim_core.config import WorldConfig
+from sim_core.plugins import METHODS, SCENES, identity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,7 +141,7 @@ class RunConfig:
     @property
     def name(self) -> str:
         """What people call a run of this config, such as `sensor 10r×2g s0`."""
-        what = f"{self.world.method} {self.world.setup}" if self.env.is_swarm else self.env_id
+        what = f"{self.world.method_name} {self.world.setup}" if self.env.is_swarm else self.env_id
         return f"{what} s{self.seed}"
 
     @property
@@ -264,9 +265,17 @@ def from_dict(values: dict[str, Any]) -> RunConfig:
     return RunConfig(**plain)
 
 
+def identity_dict(config: RunConfig) -> dict[str, Any]:
+    """The config as plain values for hashes: a user's own files count by their names and texts, not their folders."""
+    values = to_dict(config)
+    for kind in (METHODS, SCENES):
+        values["world"][kind.setting] = identity(kind, values["world"][kind.setting])
+    return values
+
+
 def config_hash(config: RunConfig) -> str:
     """Twelve hex digits that tell configs apart; how long and where a run goes on does not count."""
-    values = to_dict(config)
+    values = identity_dict(config)
     for name in ("total_env_steps", *WHERE):
         values.pop(name)
     text = json.dumps(values, sort_keys=True)

@@ -17,6 +17,8 @@ knows. It learns from three steps and more samples, and
 - M_sensor counts own and other robots apart: their difference hides a crowd of both;
 - M_IN and M_OUT are rewarded for progress towards the goal inside the ellipse, not for being inside: with few robots
   the learning robot can hardly leave an ellipse that it spans, and lingers.
+
+What a preset sets for one method alone stands with the method (`Method.presets`).
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from learner.config import RunConfig
-from sim_core.config import MethodName, WorldConfig
+from sim_core.config import WorldConfig
+from sim_core.plugins import METHODS, load, read_source
 
 PresetName = Literal["thesis", "best"]
 
@@ -39,32 +42,20 @@ _COMMON: dict[str, Any] = {
     "steps_per_block": 32,
     "updates_per_call": 32,
 }
-_TRAINING: dict[tuple[PresetName, MethodName], dict[str, Any]] = {
-    ("thesis", "sensor"): {"n_step": 1, "samples_per_insert": 1.5},
-    ("thesis", "in"): {"n_step": 1, "samples_per_insert": 4.0},
-    ("thesis", "out"): {"n_step": 1, "samples_per_insert": 4.0},
-    ("best", "sensor"): {"n_step": 3, "samples_per_insert": 3.0},
-    ("best", "in"): {"n_step": 3, "samples_per_insert": 4.0},
-    ("best", "out"): {"n_step": 3, "samples_per_insert": 4.0},
-}
-_SWARM: dict[str, Any] = {"max_neighbours": 16, "orca_radius_m": 0.18, "robot_radius_m": 0.06}
-_ELLIPSES: dict[str, Any] = {**_SWARM, "ellipse_counts_learner": True, "learner_speed_limit_m_s": 1.5}
-_PROGRESS: dict[str, Any] = {**_ELLIPSES, "ellipse_reward": "progress"}
-_WORLD: dict[tuple[PresetName, MethodName], dict[str, Any]] = {
-    ("thesis", "sensor"): _SWARM,
-    ("thesis", "in"): _ELLIPSES,
-    ("thesis", "out"): _ELLIPSES,
-    ("best", "sensor"): {**_SWARM, "sensor_counts": "separate"},
-    ("best", "in"): _PROGRESS,
-    ("best", "out"): _PROGRESS,
-}
 
 
-def preset_config(name: PresetName, method: MethodName, robots: int = 10, groups: int = 2) -> RunConfig:
-    """The settings that a preset gives one method in one setup.
+def preset_config(name: PresetName, method: str, robots: int = 10, groups: int = 2) -> RunConfig:
+    """The settings that a preset gives one method in one setup; a method without presets takes M_sensor's.
+
+    Args:
+      name: the preset.
+      method: a method's name or `FILE.py:CLASS`.
+      robots: robots per group.
+      groups: groups.
 
     Raises:
-      ConfigError: the setup is not possible.
+      ConfigError: the method is unknown or the setup is not possible.
     """
-    world = WorldConfig(method=method, robots=robots, groups=groups, **_WORLD[name, method])
-    return RunConfig(world=world, **_COMMON, **_TRAINING[name, method])
+    presets = load(METHODS, *read_source(METHODS, method)).presets or load(METHODS, "sensor", "").presets
+    training, world = presets[name]
+    return RunConfig(world=WorldConfig(method=method, robots=robots, groups=groups, **world), **_COMMON, **training)

@@ -6,15 +6,19 @@ kernel. Field names carry their unit (`_m`, `_s`, `_m_s`, `_deg`, `_steps`).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from sim_core.checks import check_fields, require
+from sim_core.plugins import METHODS, SCENES, Kind, guarded, load, read_source, short_name
+
+if TYPE_CHECKING:
+    from sim_core.methods.base import Method
+    from sim_core.scenes.base import Scene
 
 MAX_HEADINGS = 64
-MethodName = Literal["sensor", "in", "out"]
-"""State representations: M_sensor (Chapter 3), M_IN and M_OUT (Chapter 4)."""
+MAX_ROBOTS = 100_000
+"""Most robots of one world."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +33,11 @@ class WorldConfig:
     """Robots per group, the 10 of 10r x 2g; the learning robot counts."""
     groups: int = 2
     """Number of groups, the 2 of 10r x 2g."""
-    method: MethodName = "sensor"
-    """State representation of the learning robot: M_sensor (Chapter 3), M_IN or M_OUT (Chapter 4)."""
+    method: str = "sensor"
+    """State representation of the learning robot: sensor (M_sensor, Chapter 3), in or out (M_IN, M_OUT, Chapter 4), or
+    your own, FILE.py:CLASS."""
+    scene: str = "circle"
+    """Start positions and goals: circle (groups cross a circle, 3.1), or your own, FILE.py:CLASS."""
     swarm_knows_learner: Literal["method", "yes", "no"] = "method"
     """Whether the swarm avoids the learning robot and counts it in its flock (the method's: M_sensor only)."""
     horizon_is: Literal["method", "cut", "failure"] = "method"
@@ -141,16 +148,46 @@ class WorldConfig:
     uniform_slow_radius_m: float = 0.25
     """`uniform`: robots slow down within this distance of the goal."""
 
+    method_source: str = ""
+    """Text of the file that `method` names; read when the settings are made, and kept with them."""
+    scene_source: str = ""
+    """Text of the file that `scene` names; read when the settings are made, and kept with them."""
+
     def __post_init__(self) -> None:
         check_fields(self)
+        _take_source(self, METHODS)
+        _take_source(self, SCENES)
         _check_counts(self)
+        object.__setattr__(self, "_group_sizes", _group_sizes(self))
         _check_lengths(self)
-        _check_start_room(self)
+        self.scene_class.check(self)
+        self.method_class.check(self)
 
     @property
     def num_robots(self) -> int:
         """Robots in one world, over all groups."""
-        return self.robots * self.groups
+        return sum(self.group_sizes)
+
+    @property
+    def group_sizes(self) -> tuple[int, ...]:
+        """Robots of each group, as the scene has them."""
+        sizes: tuple[int, ...] = self.__dict__["_group_sizes"]
+        return sizes
+
+    @property
+    def method_class(self) -> type[Method]:
+        """The class of `method`."""
+        return load(METHODS, self.method, self.method_source)
+
+    @property
+    def scene_class(self) -> type[Scene]:
+        """The class of `scene`."""
+        return load(SCENES, self.scene, self.scene_source)
+
+    @property
+    def method_name(self) -> str:
+        """What people call the method: `sensor`, or the class of a user's own."""
+        return short_name(METHODS, self.method)
 
     @property
     def num_actions(self) -> int:
@@ -160,23 +197,52 @@ class WorldConfig:
     @property
     def learner_is_known(self) -> bool:
         """Whether the swarm knows the learning robot, as `swarm_knows_learner` or the method has it."""
-        return self.method == "sensor" if self.swarm_knows_learner == "method" else self.swarm_knows_learner == "yes"
+        by_method = self.swarm_knows_learner == "method"
+        return self.method_class.swarm_knows_learner if by_method else self.swarm_knows_learner == "yes"
 
     @property
     def timeout_fails(self) -> bool:
         """Whether a timeout is a terminal failure, as `horizon_is` or the method has it."""
-        return self.method != "sensor" if self.horizon_is == "method" else self.horizon_is == "failure"
+        return self.method_class.timeout_fails if self.horizon_is == "method" else self.horizon_is == "failure"
 
     @property
     def top_speed_m_s(self) -> float:
         """Largest speed of any robot, the learning robot's too."""
-        learner_m_s = self.learner_speed_limit_m_s if self.method == "out" else self.learner_speed_m_s
-        return max(self.max_speed_m_s, learner_m_s)
+        return max(self.max_speed_m_s, self.method_class.top_speed_m_s(self))
 
     @property
     def setup(self) -> str:
-        """The setup as the dissertation writes it, such as `10r×2g`."""
-        return f"{self.robots}r×{self.groups}g"
+        """The setup as the dissertation writes it, such as `10r×2g`; another scene's name stands before it."""
+        sizes = self.group_sizes
+        alike = f"{sizes[0]}r×{self.groups}g" if len(set(sizes)) == 1 else f"{'+'.join(map(str, sizes))}r"
+        return alike if self.scene in SCENES.built_in else f"{short_name(SCENES, self.scene)} {alike}"
+
+
+def _take_source(config: WorldConfig, kind: Kind) -> None:
+    """Reads the file that a setting names, unless its text is there already."""
+    name, source = getattr(config, kind.setting), getattr(config, f"{kind.setting}_source")
+    if name in kind.built_in or not source:
+        name, text = read_source(kind, name)
+        require(not source, f"{kind.setting}_source must be empty for {kind.setting} {name!r}, which is no file")
+        object.__setattr__(config, kind.setting, name)
+        object.__setattr__(config, f"{kind.setting}_source", text)
+    load(kind, name, getattr(config, f"{kind.setting}_source"))
+
+
+def _group_sizes(config: WorldConfig) -> tuple[int, ...]:
+    require(
+        config.robots * config.groups <= MAX_ROBOTS,
+        f"robots × groups is {config.robots * config.groups}; at most {MAX_ROBOTS} robots fit one world: lower robots "
+        "or groups",
+    )
+    scene = config.scene_class
+    with guarded(scene, "group_sizes"):
+        sizes = tuple(int(size) for size in scene.group_sizes(config))
+    require(
+        len(sizes) == config.groups and min(sizes) >= 2 and sum(sizes) <= MAX_ROBOTS,
+        f"scene {scene.__name__} must have groups ({config.groups}) sizes of at least 2 robots, not {sizes}",
+    )
+    return sizes
 
 
 def _check_counts(config: WorldConfig) -> None:
@@ -185,23 +251,10 @@ def _check_counts(config: WorldConfig) -> None:
         f"robots must be at least 2 per group (the learning robot needs one to follow), not {config.robots}",
     )
     require(config.groups >= 1, f"groups must be at least 1, not {config.groups}")
-    require(
-        config.num_robots <= 100_000,
-        f"robots × groups is {config.num_robots}; at most 100000 robots fit one world: lower robots or groups",
-    )
     require(2 <= config.sectors <= MAX_HEADINGS, f"sectors must be between 2 and {MAX_HEADINGS}, not {config.sectors}")
     require(config.horizon_steps >= 1, f"horizon_steps must be at least 1, not {config.horizon_steps}")
     require(
         config.outside_limit_steps >= 1, f"outside_limit_steps must be at least 1, not {config.outside_limit_steps}"
-    )
-    require(
-        config.method == "sensor" or config.ellipse_counts_learner or config.robots >= 3,
-        f"robots must be at least 3 per group for method {config.method!r}, not {config.robots}: an ellipse without "
-        "the learning robot (ellipse_counts_learner) needs two others",
-    )
-    require(
-        config.method == "sensor" or config.sector_frame == "world",
-        f"sector_frame must be 'world' for method {config.method!r}, whose state is in the world's frame",
     )
     require(1 <= config.max_neighbours <= 64, f"max_neighbours must be between 1 and 64, not {config.max_neighbours}")
 
@@ -236,49 +289,9 @@ def _check_lengths(config: WorldConfig) -> None:
         f"orca_radius_m ({config.orca_radius_m}) must be at least robot_radius_m ({config.robot_radius_m}), "
         "or ORCA steers into collisions",
     )
-    require(
-        config.method != "out" or config.learner_speed_limit_m_s >= config.learner_speed_m_s,
-        f"learner_speed_limit_m_s ({config.learner_speed_limit_m_s}) must be at least learner_speed_m_s "
-        f"({config.learner_speed_m_s}), the speed of u_nn alone",
-    )
     step_m = config.time_step_s * config.top_speed_m_s
     require(
         step_m <= 2 * config.robot_radius_m,
         f"time_step_s ({config.time_step_s}) lets a robot jump {step_m:.3g} m in a step, past another robot: "
         f"keep time_step_s × speed at most 2 × robot_radius_m ({2 * config.robot_radius_m:.3g} m)",
-    )
-
-
-def start_grid_radius_m(config: WorldConfig) -> float:
-    """Distance from a group's centre to its farthest possible start position."""
-    columns = math.ceil(math.sqrt(config.robots))
-    rows = math.ceil(config.robots / columns)
-    half_m = 0.5 * config.start_spacing_m
-    return math.hypot((columns - 1) * half_m + config.start_jitter_m, (rows - 1) * half_m + config.start_jitter_m)
-
-
-def _check_start_room(config: WorldConfig) -> None:
-    gap_m = config.start_spacing_m - 2 * config.start_jitter_m
-    require(
-        gap_m >= 2 * config.robot_radius_m,
-        f"robots would overlap at the start: start_spacing_m ({config.start_spacing_m}) less twice start_jitter_m "
-        f"must be at least 2 × robot_radius_m ({2 * config.robot_radius_m:.3g} m)",
-    )
-    require(
-        math.hypot(config.start_spacing_m + 2 * config.start_jitter_m, 2 * config.start_jitter_m)
-        < config.outer_radius_m,
-        f"the learning robot could start lost: its next robot, start_spacing_m ({config.start_spacing_m}) away "
-        f"and each shifted by start_jitter_m, must be nearer than outer_radius_m (R2 = {config.outer_radius_m})",
-    )
-    require(
-        2 * config.arena_radius_m - start_grid_radius_m(config) > config.outer_radius_m,
-        f"groups would start at their goal: arena_radius_m ({config.arena_radius_m}) must put the start "
-        f"grid farther than outer_radius_m (R2 = {config.outer_radius_m}) from the goal opposite",
-    )
-    room_m = 2 * config.arena_radius_m * math.sin(math.pi / config.groups) if config.groups > 1 else math.inf
-    need_m = 2 * (start_grid_radius_m(config) + config.robot_radius_m)
-    require(
-        room_m >= need_m,
-        f"{config.setup} does not fit: neighbouring start grids need {need_m:.2f} m "
-        f"but their centres are {room_m:.2f} m apart; raise arena_radius_m or lower robots or groups",
     )

@@ -39,12 +39,13 @@ def _cache_folder() -> str:
     return str(base / f"kernels-{digest.hexdigest()[:16]}")
 
 
-_FOLDER = _cache_folder()
+CACHE_FOLDER = _cache_folder()
+"""Where this version's compiled kernels lie."""
 
 
 def _compiled(function: Any, **options: Any) -> Any:
     theirs = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _FOLDER  # read while the kernel is made; other users of numba keep their setting
+    numba.config.CACHE_DIR = CACHE_FOLDER  # read while the kernel is made; other users of numba keep their setting
     try:
         return njit(**(JIT_OPTIONS | options))(function)
     finally:

@@ -47,34 +47,36 @@ def collides(robot, pos_x, pos_y, distance_sq):
 
 
 @kernel
-def sensed(robot, robots, pos_x, pos_y, range_sq):
-    """(own, others): robots of the own and of other groups within the sensing range."""
+def sensed(robot, begin, end, pos_x, pos_y, range_sq):
+    """(own, others): robots of the own group begin..end-1 and of other groups within the sensing range."""
     own, others = -1, 0  # the robot itself is not counted
-    group_begin = robot // robots * robots
     for other in range(pos_x.shape[0]):
         dx, dy = pos_x[other] - pos_x[robot], pos_y[other] - pos_y[robot]
         if dx * dx + dy * dy < range_sq:
-            mate = group_begin <= other < group_begin + robots
+            mate = begin <= other < end
             own, others = own + mate, others + (not mate)
     return own, others
 
 
 @kernel
-def group_goal_distance_m(group, robots, pos_x, pos_y, goal_x, goal_y):
-    """Mean distance of a group's robots to its goal (Eq. 3.2), metres."""
+def group_goal_distance_m(begin, end, pos_x, pos_y, goal_x, goal_y):
+    """Mean distance of the robots begin..end-1 to the point (goal_x, goal_y) (Eq. 3.2), metres."""
     total = 0.0
-    for i in range(group * robots, (group + 1) * robots):
-        dx, dy = pos_x[i] - goal_x[group], pos_y[i] - goal_y[group]
+    for i in range(begin, end):
+        dx, dy = pos_x[i] - goal_x, pos_y[i] - goal_y
         total += np.sqrt(dx * dx + dy * dy)
-    return total / robots
+    return total / (end - begin)
 
 
 @kernel
-def collision_or_goal(robot, robots, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m):
-    """COLLISION or GOAL where one holds after a step, else RUNNING; the same for every method."""
+def collision_or_goal(robot, begin, end, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m):
+    """COLLISION or GOAL where one holds after a step, else RUNNING; the same for every method.
+
+    The robot's group are the robots begin..end-1, its goal is (goal_x, goal_y).
+    """
     if collides(robot, pos_x, pos_y, collision_sq):
         return _COLLISION
-    if group_goal_distance_m(robot // robots, robots, pos_x, pos_y, goal_x, goal_y) < range_m:
+    if group_goal_distance_m(begin, end, pos_x, pos_y, goal_x, goal_y) < range_m:
         return _GOAL
     return _RUNNING
 
@@ -104,20 +106,20 @@ def surrounded(robot, pos_x, pos_y, range_sq):
 
 
 @kernel
-def lost_or_captured(robot, robots, pos_x, pos_y, range_sq, must_surround):
+def lost_or_captured(robot, begin, end, pos_x, pos_y, range_sq, must_surround):
     """How a robot fails that is away from its group; `must_surround` as `captured_is` has it."""
-    own, others = sensed(robot, robots, pos_x, pos_y, range_sq)
+    own, others = sensed(robot, begin, end, pos_x, pos_y, range_sq)
     if own > 0 or others == 0 or (must_surround and not surrounded(robot, pos_x, pos_y, range_sq)):
         return _LOST
     return _CAPTURED
 
 
 @kernel
-def end_of_step(robot, robots, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m, must_surround):
+def end_of_step(robot, begin, end, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m, must_surround):
     """Outcome of one world after a step of a robot that is lost once it senses no own robot."""
-    ended = collision_or_goal(robot, robots, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m)
+    ended = collision_or_goal(robot, begin, end, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m)
     if ended != _RUNNING:
         return ended
     range_sq = range_m * range_m
-    own, _ = sensed(robot, robots, pos_x, pos_y, range_sq)
-    return lost_or_captured(robot, robots, pos_x, pos_y, range_sq, must_surround) if own == 0 else _RUNNING
+    own, _ = sensed(robot, begin, end, pos_x, pos_y, range_sq)
+    return lost_or_captured(robot, begin, end, pos_x, pos_y, range_sq, must_surround) if own == 0 else _RUNNING

@@ -13,7 +13,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim_core.config import WorldConfig, start_grid_radius_m
+from sim_core.config import WorldConfig
+from sim_core.scenes.base import GOAL_HALF_SIDE_M
 
 Floats = NDArray[np.floating]
 Shape = Callable[[Floats, Floats], Floats]
@@ -34,7 +35,6 @@ GROUP_COLOURS = (
 """Group g has colour g modulo the count: Okabe and Ito's seven, then three of Paul Tol's muted scheme."""
 
 MIN_ROBOT_RADIUS_PX = 3.0
-GOAL_HALF_SIDE_M = 0.35
 WHITE, BLACK, OUTLINE, ARENA, SENSING = "#FFFFFF", "#000000", "#4A4A4A", "#DADDE1", "#666666"
 
 
@@ -50,8 +50,7 @@ def group_rgb(groups: int) -> NDArray[np.uint8]:
 
 def view_half_m(config: WorldConfig) -> float:
     """Half the edge of the square view around the arena's centre: every start and every goal is inside it."""
-    margin_m = max(start_grid_radius_m(config) + config.robot_radius_m, GOAL_HALF_SIDE_M)
-    return config.arena_radius_m + margin_m + 0.3
+    return config.scene_class.view_half_m(config)
 
 
 def to_pixels(point_m: ArrayLike, config: WorldConfig, size_px: int) -> Floats:
@@ -66,7 +65,7 @@ def draw_world(
     """Draws one world.
 
     Args:
-      position: `[num_robots, 2]`, metres; robot i is of group i // config.robots.
+      position: `[num_robots, 2]`, metres; group after group (`config.group_sizes`).
       goal: `[groups, 2]`, metres.
       learner: index of the learning robot.
       config: the setup.
@@ -80,12 +79,13 @@ def draw_world(
     radius_px = max(config.robot_radius_m * px_per_m, MIN_ROBOT_RADIUS_PX)
     robot_px, goal_px = to_pixels(position, config, size_px), to_pixels(goal, config, size_px)
     colours = group_rgb(config.groups)
-    own_group = learner // config.robots
+    group = np.repeat(np.arange(config.groups), config.group_sizes)
+    own_group = int(group[learner])
 
     _draw_goals(image, goal_px, GOAL_HALF_SIDE_M * px_per_m, colours, own_group)
     _draw_sensing(image, robot_px[learner], config.outer_radius_m * px_per_m)
     swarm = np.arange(len(robot_px)) != learner
-    swarm_colours = colours[np.flatnonzero(swarm) // config.robots]
+    swarm_colours = colours[group[swarm]]
     _splat_discs(image, robot_px[swarm], radius_px + 0.6, np.broadcast_to(colour_rgb(OUTLINE), swarm_colours.shape))
     _splat_discs(image, robot_px[swarm], radius_px - 0.4, swarm_colours)
     _draw_learner(image, robot_px[learner], radius_px, colours[own_group])
@@ -96,6 +96,9 @@ def draw_world(
 def _background(config: WorldConfig, size_px: int) -> NDArray[np.uint8]:
     """White `[size_px, size_px, 3]` with the circle of the start centres; shared, so copy before drawing."""
     image = np.full((size_px, size_px, 3), 255, np.uint8)
+    if not config.scene_class.draws_circle:
+        image.setflags(write=False)
+        return image
     centre, edge = to_pixels((0.0, 0.0), config, size_px), to_pixels((config.arena_radius_m, 0.0), config, size_px)
     radius_px = float(edge[0] - centre[0])
     _paint(image, centre, radius_px + 1.0, _ring(radius_px, 1.5), ARENA)

@@ -42,6 +42,13 @@ def uniform(state, world):
     return value
 
 
+@kernel
+def fill_uniform(state, world, out):
+    """Writes the next draws of `state[world]` to `out` `[count]` float64, each in [0, 1)."""
+    for i in range(out.shape[0]):
+        out[i] = uniform(state, world)
+
+
 def world_streams(seed: int, num_worlds: int) -> NDArray[np.uint64]:
     """Independent initial states `[num_worlds]` uint64 for worlds of one batch."""
     return np.random.SeedSequence(seed).generate_state(num_worlds, dtype=np.uint64).astype(np.uint64)

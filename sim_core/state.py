@@ -7,16 +7,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sim_core.config import WorldConfig
+from sim_core.jit import kernel
 
 
 class WorldState(NamedTuple):
-    """All that a batch of worlds needs to go on; structure of arrays, robot i is of group i // robots.
+    """All that a batch of worlds needs to go on, as a structure of arrays.
 
     Shapes: pos_*, vel_* `[num_worlds, num_robots]` (metres, m/s); goal_* `[num_worlds, groups]`; learner,
     steps, outside_steps `[num_worlds]` int32 (env steps so far, and the last ones outside the own ellipse,
     one after the other); goal_distance_m `[num_worlds]` (the learning robot's, before the step);
     episode_return `[num_worlds]` float64; rng `[num_worlds]` uint64; machine `[num_worlds, num_robots]`
-    int8, the FL-ORCA state of the last step.
+    int8, the FL-ORCA state of the last step. Alike in all worlds and never changed: group `[num_robots]` int32, each
+    robot's group; group_begin `[groups + 1]` int32, the first robot of each group, then num_robots.
     """
 
     pos_x: Any
@@ -32,6 +34,19 @@ class WorldState(NamedTuple):
     episode_return: Any
     rng: Any
     machine: Any
+    group: Any
+    group_begin: Any
+
+
+CONSTANT = ("group", "group_begin")
+"""Arrays that the settings decide; no checkpoint holds them."""
+
+
+@kernel
+def own_group(state, world):
+    """(group, begin, end): the learning robot's group, whose robots are begin..end-1."""
+    group = state.group[state.learner[world]]
+    return group, state.group_begin[group], state.group_begin[group + 1]
 
 
 def empty_state(config: WorldConfig, num_worlds: int, dtype: Any) -> WorldState:
@@ -51,4 +66,6 @@ def empty_state(config: WorldConfig, num_worlds: int, dtype: Any) -> WorldState:
         episode_return=np.zeros(num_worlds, np.float64),
         rng=np.zeros(num_worlds, np.uint64),
         machine=np.zeros(robots, np.int8),
+        group=np.repeat(np.arange(config.groups, dtype=np.int32), config.group_sizes),
+        group_begin=np.concatenate([[0], np.cumsum(config.group_sizes)]).astype(np.int32),
     )

@@ -12,9 +12,9 @@ from sim_core.methods import make_method
 from sim_core.outcomes import Outcome
 from sim_core.packed import packed
 from sim_core.rng import world_streams
-from sim_core.state import WorldState, empty_state
-from sim_core.swarm.scenario import scenario_params
-from sim_core.swarm.step import advance, restart, swarm_params
+from sim_core.scenes import make_scene
+from sim_core.state import CONSTANT, WorldState, empty_state
+from sim_core.swarm.step import advance, reset_episode, swarm_params
 from sim_core.swarm.tile import world_tile
 
 
@@ -47,7 +47,7 @@ class WorldBatch:
         self.state: WorldState = empty_state(config, num_worlds, np.float32)
         self.tile = world_tile(config, num_worlds, np.float32)
         self.swarm = packed(swarm_params(config, np.float32))
-        self._scenario = scenario_params(config)
+        self.scene = make_scene(config)
         self._command_x = np.zeros(num_worlds, np.float32)
         self._command_y = np.zeros(num_worlds, np.float32)
         self._observation = np.zeros((num_worlds, *self.method.observation_shape), self.method.observation_dtype)
@@ -73,7 +73,8 @@ class WorldBatch:
           Observations of all worlds, a copy.
         """
         mask = self._all if mask is None else mask
-        restart(self.state, mask, self._scenario)
+        self.scene.start(self.state, mask)
+        reset_episode(self.state, mask)
         self.method.perceive(self.state, mask, self._observation)
         return self._observation.copy()
 
@@ -117,9 +118,13 @@ class WorldBatch:
         """Goals `[num_worlds, groups, 2]`, metres."""
         return np.stack([self.state.goal_x, self.state.goal_y], axis=-1)
 
+    def _changing(self) -> dict[str, NDArray[Any]]:
+        """The arrays that steps change."""
+        return {name: array for name, array in self.state._asdict().items() if name not in CONSTANT}
+
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Copies of all arrays that a checkpoint needs, by name."""
-        return {name: array.copy() for name, array in self.state._asdict().items()}
+        return {name: array.copy() for name, array in self._changing().items()}
 
     def set_state(self, saved: dict[str, NDArray[Any]]) -> NDArray[Any]:
         """Takes up saved arrays; returns the observations there.
@@ -127,7 +132,7 @@ class WorldBatch:
         Raises:
           ValueError: an array is missing or has another shape or dtype; nothing is taken up.
         """
-        arrays = self.state._asdict()
+        arrays = self._changing()
         for name, array in arrays.items():
             new = saved.get(name)
             if new is None or new.shape != array.shape or new.dtype != array.dtype:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.evaluation.trajectory import NO_ACTION, Episode
-from actors.policy.baselines import Baseline, Player, make_baseline
+from actors.policy.baselines import ActionRule, Baseline, make_baseline
 from actors.policy.network import Policy, WeightsSnapshot
 from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
 from actors.rollout.worker import join_stats
@@ -33,7 +33,7 @@ Candidate = WeightsSnapshot | Baseline
 
 
 class GreedyPolicy:
-    """A learned policy that takes the action of the highest value; implements `actors.policy.baselines.Player`.
+    """A learned policy that takes the action of the highest value; implements `actors.policy.baselines.ActionRule`.
 
     Args:
       weights: the snapshot to act with.
@@ -47,7 +47,7 @@ class GreedyPolicy:
         return self._policy.greedy(observation)
 
 
-def make_player(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> Player:
+def make_action_rule(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> ActionRule:
     """What chooses the candidate's actions in one episode a seed, all played at once.
 
     Raises:
@@ -66,10 +66,10 @@ def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> EpisodeSt
       One entry a seed, in order.
 
     Raises:
-      ConfigError: see `make_player`.
+      ConfigError: see `make_action_rule`.
     """
     chunks = [seeds[i : i + MAX_ENVS] for i in range(0, len(seeds), MAX_ENVS)]
-    return join_stats([_play(spec, make_player(spec, candidate, chunk), chunk) for chunk in chunks])
+    return join_stats([_play(spec, make_action_rule(spec, candidate, chunk), chunk) for chunk in chunks])
 
 
 def evaluate_in_parts(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: list[int], parts: int) -> EpisodeStats:
@@ -174,14 +174,14 @@ class _Environments:
         self._env.close()
 
 
-def _play(spec: EnvSpec, player: Player, seeds: list[int]) -> EpisodeStats:
+def _play(spec: EnvSpec, rule: ActionRule, seeds: list[int]) -> EpisodeStats:
     count = len(seeds)
     stats = EpisodeStats(np.full(count, NO_OUTCOME, np.int8), np.zeros(count, np.int32), np.zeros(count))
     stage = _Worlds(spec.world, seeds) if spec.is_swarm else _Environments(spec, seeds)
     observation = stage.start()
     running = np.ones(count, np.bool_)
     while running.any():
-        observation, reward, done, outcome = stage.step(player.act(observation))
+        observation, reward, done, outcome = stage.step(rule.act(observation))
         stats.length_steps[running] += 1
         stats.episode_return[running] += reward[running]
         ended = running & done
@@ -194,13 +194,13 @@ def _play(spec: EnvSpec, player: Player, seeds: list[int]) -> EpisodeStats:
 def record_episode(spec: EnvSpec, candidate: Candidate, seed: int) -> Episode:
     """Plays one episode of our own environment and keeps every state."""
     worlds = WorldBatch(spec.world, 1)
-    player = make_player(spec, candidate, [seed])
+    rule = make_action_rule(spec, candidate, [seed])
     worlds.seed([seed])
     observation = worlds.reset()
     states, actions, rewards = [_state_of(worlds)], list[int](), list[float]()
     outcome = Outcome.RUNNING
     while outcome == Outcome.RUNNING:
-        action = player.act(observation)
+        action = rule.act(observation)
         result = worlds.step(action)
         observation, outcome = result.observation, Outcome(result.outcome[0])
         states.append(_state_of(worlds))

@@ -1,8 +1,7 @@
-"""Ways to drive the learning robot that need no learning: what learned policies are measured against.
+"""Rules that drive the learning robot and learn nothing: what learned policies are measured against.
 
-`fl-orca` drives it as every other robot of the swarm, knowing its goal and its neighbours' velocities, of which the
-learner's observation holds less or nothing. `greedy` heads for where the observation shows the own group. `random`
-draws actions.
+`fl-orca` drives it as every other robot of the swarm: it knows its goal and its neighbours' velocities, which the
+learning robot's observation does not hold. `greedy` is the method's own rule. `random` draws actions.
 """
 
 from __future__ import annotations
@@ -13,11 +12,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
-from sim_core.methods.headings import heading_velocities
 
 
-class Player(Protocol):
+class ActionRule(Protocol):
     """Chooses the actions of a batch of episodes that were started together, one call an env step."""
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.int64] | None:
@@ -33,53 +32,35 @@ class Baseline(enum.StrEnum):
     RANDOM = "random"
 
 
-class FlOrcaPlayer:
+class FlOrcaRule:
     """FL-ORCA itself, which obeys no action: one speed less heading, and waits where it must."""
 
     def act(self, observation: NDArray[Any]) -> None:
-        """None; see Player."""
+        """None; see ActionRule."""
 
 
-class GreedySensorPlayer:
-    """M_sensor: heads into the sector with the most own robots less other robots, over both sensing regions.
-
-    Among equal sectors, the one with the most in the outer ring: its robots are those that are about to be lost.
-    Among these, the lowest index, as a learned policy does.
+class GreedyMethodRule:
+    """The greedy rule of the world's method (`sim_core.methods.base.Method.greedy`).
 
     Args:
       config: the setup.
+
+    Raises:
+      ConfigError: the method has none.
     """
 
     def __init__(self, config: WorldConfig) -> None:
-        self._cells = 2 * config.sectors
-        self._separate = config.sensor_counts == "separate"
+        rule = config.method_class.greedy(config)
+        if rule is None:
+            raise ConfigError(f"method {config.method_name} has no greedy rule; play fl-orca or random")
+        self._rule = rule
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.int64]:
-        """Actions `[batch]` for counts `[batch, 2q]`, or `[batch, 4q]` where they are apart."""
-        counts = observation.astype(np.int64)
-        own, others = counts[:, : self._cells], counts[:, self._cells :]
-        inner, ring = np.split(own - others if self._separate else own, 2, axis=1)
-        size = 2 * np.abs(ring).max(initial=0) + 1  # more than two rings can differ by
-        return np.asarray(np.argmax(size * (inner + ring) + ring, axis=1), np.int64)
+        """Actions `[batch]` for observations `[batch, *shape]`."""
+        return self._rule(observation)
 
 
-class GreedyEllipsePlayer:
-    """M_IN and M_OUT: the heading nearest to the direction of the own group's centre; the lowest index among equals.
-
-    Args:
-      config: the setup.
-    """
-
-    def __init__(self, config: WorldConfig) -> None:
-        self._headings = heading_velocities(config, np.float64)[: config.sectors]
-
-    def act(self, observation: NDArray[Any]) -> NDArray[np.int64]:
-        """Actions `[batch]` for state matrices `[batch, groups * columns]`, the own group's row first."""
-        centre = observation[:, 2:4].astype(np.float64)
-        return np.asarray(np.argmax(centre @ self._headings.T, axis=1), np.int64)
-
-
-class RandomPlayer:
+class RandomRule:
     """Uniform actions, of a stream of each episode's own: they do not depend on which episodes play together.
 
     The stream is a child of the episode's seed; the world's is that of the seed itself.
@@ -99,10 +80,12 @@ class RandomPlayer:
         return next(self._actions)
 
 
-def make_baseline(baseline: Baseline, config: WorldConfig, seeds: list[int]) -> Player:
-    """The player of a baseline in our own environment, for one episode a seed."""
+def make_baseline(baseline: Baseline, config: WorldConfig, seeds: list[int]) -> ActionRule:
+    """The action rule of a baseline in our own environment, for one episode a seed.
+
+    Raises:
+      ConfigError: the method has no such rule.
+    """
     if baseline is Baseline.FL_ORCA:
-        return FlOrcaPlayer()
-    if baseline is Baseline.RANDOM:
-        return RandomPlayer(config, seeds)
-    return GreedySensorPlayer(config) if config.method == "sensor" else GreedyEllipsePlayer(config)
+        return FlOrcaRule()
+    return RandomRule(config, seeds) if baseline is Baseline.RANDOM else GreedyMethodRule(config)

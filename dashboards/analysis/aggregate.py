@@ -20,12 +20,12 @@ import numpy as np
 from actors.evaluation import statistics as estimates
 from actors.evaluation.result_table import GROUPS, LEARNED, ROBOTS, ResultRow
 from actors.evaluation.statistics import Estimate, dispersion
+from dashboards.analysis.methods import in_order
 from sim_core.checks import require
 from sim_core.outcomes import ENDED, Outcome
 
-METHOD_NAMES = {"sensor": "M_sensor", "in": "M_IN", "out": "M_OUT"}
-"""The methods by their name in a table; printed in this order."""
-NUM_CELLS = len(METHOD_NAMES) * len(ROBOTS) * len(GROUPS)
+CELLS_PER_METHOD = len(ROBOTS) * len(GROUPS)
+"""The dissertation's setups."""
 
 
 rate = functools.lru_cache(maxsize=8192)(estimates.rate)
@@ -160,6 +160,10 @@ class Results:
     def cells(self) -> list[Cell]:
         """All cells, Fixed and Extrapolation."""
         return list(self._cells.values())
+
+    def methods(self) -> list[str]:
+        """The dissertation's three methods, then others that there are results of."""
+        return in_order(method for method, _, _ in self._cells)
 
     def fixed_present(self, method: str) -> list[Setup]:
         """The dissertation's setups whose Fixed cell is there."""

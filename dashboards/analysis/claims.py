@@ -20,7 +20,6 @@ from itertools import pairwise
 from actors.evaluation.result_table import GROUPS, ROBOTS
 from actors.evaluation.statistics import ratio
 from dashboards.analysis.aggregate import (
-    METHOD_NAMES,
     SETUPS,
     Cell,
     Measured,
@@ -48,6 +47,7 @@ from dashboards.analysis.claim_checks import (
     no_worse,
     rises,
 )
+from dashboards.analysis.methods import method_label
 from sim_core.outcomes import Outcome
 
 
@@ -155,7 +155,7 @@ def _out_beats_all(results: Results) -> list[Check]:
     rivals = [(setup, rival) for setup in SETUPS for rival in ("sensor", "in")]
     return [
         rises(
-            f"{setup} M_OUT less {METHOD_NAMES[rival]}",
+            f"{setup} M_OUT less {method_label(rival)}",
             difference(_rate(results, "out", *setup), _rate(results, rival, *setup)),
         )._replace(setup=setup)
         for setup, rival in rivals
@@ -195,7 +195,7 @@ def _out_is_steady(results: Results) -> list[Check]:
 def _out_fails_less(results: Results) -> list[Check]:
     gone = {method: {n: over_groups(results, method, n, lost) for n in ROBOTS} for method in ("sensor", "out")}
     taken = {method: {n: over_groups(results, method, n, captured) for n in ROBOTS} for method in ("sensor", "out")}
-    both = [(method, METHOD_NAMES[method]) for method in ("sensor", "out")]
+    both = [(method, method_label(method)) for method in ("sensor", "out")]
     return [
         *(rises(f"{n}r lost, M_sensor less M_OUT", difference(gone["sensor"][n], gone["out"][n])) for n in ROBOTS),
         *(

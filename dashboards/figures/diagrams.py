@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from dashboards.analysis.aggregate import Setup
 from dashboards.figures.style import GRID, MUTED, TEXT, new_figure
-from sim_core.config import MethodName, WorldConfig
+from sim_core.config import WorldConfig
 from sim_core.methods.apf import field_of, field_params
 from sim_core.methods.ellipse import ellipse_params, group_ellipse, left_out_of
 from sim_core.methods.headings import heading_velocities
@@ -103,14 +104,15 @@ def group_ellipses(worlds: WorldBatch, config: WorldConfig) -> list[GroupEllipse
     """(a, b, x_c, y_c, theta) of each group of world 0, as M_IN and M_OUT see them with the settings of `config`."""
     params, state = ellipse_params(config), worlds.state
     left_out = left_out_of(state.learner[0], params)
-    return [group_ellipse(group, state.pos_x[0], state.pos_y[0], left_out, params) for group in range(config.groups)]
+    pos_x, pos_y = state.pos_x[0], state.pos_y[0]
+    return [group_ellipse(begin, end, pos_x, pos_y, left_out, params) for begin, end in pairwise(state.group_begin)]
 
 
 def sector_frame(worlds: WorldBatch) -> Vector:
     """The rotation `[2, 2]` from the frame of the sectors of world 0 to the world's."""
     if worlds.config.sector_frame == "world":
         return np.eye(2)
-    own = int(worlds.state.learner[0]) // worlds.config.robots
+    own = int(worlds.state.group[worlds.state.learner[0]])
     x, y = np.array([worlds.state.goal_x[0, own], worlds.state.goal_y[0, own]], np.float64) - _learner_position(worlds)
     return np.array([[x, -y], [y, x]]) / math.hypot(x, y)
 
@@ -199,7 +201,7 @@ def _offsets(worlds: WorldBatch) -> Vector:
 
 def _heading_to_group(worlds: WorldBatch) -> int:
     """The action whose heading is nearest to the direction of the own group's centre."""
-    own = int(worlds.state.learner[0]) // worlds.config.robots
+    own = int(worlds.state.group[worlds.state.learner[0]])
     _, _, x_c, y_c, _ = group_ellipses(worlds, worlds.config)[own]
     towards = np.array([x_c, y_c]) - _learner_position(worlds)
     return int(np.argmax(heading_velocities(worlds.config, np.float64)[: worlds.config.sectors] @ towards))
@@ -209,7 +211,7 @@ def _draw_robots(axes: Axes, worlds: WorldBatch, reach_m: float, opacity: float 
     """All robots in their true size with their group's number; the learning robot is black, in the origin."""
     config, learner = worlds.config, int(worlds.state.learner[0])
     for robot, place in enumerate(_offsets(worlds)):
-        group = robot // config.robots
+        group = int(worlds.state.group[robot])
         face, ink = ("black", "white") if robot == learner else (GROUP_COLOURS[group % len(GROUP_COLOURS)], "black")
         faded = 1.0 if robot == learner else opacity
         axes.add_patch(Circle((place[0], place[1]), config.robot_radius_m, fc=face, ec=TEXT, lw=0.6, alpha=faded))
@@ -288,7 +290,7 @@ class Diagram(NamedTuple):
 
     file: str
     alt: str
-    method: MethodName
+    method: str
     setup: Setup
     draw: Callable[[WorldConfig], Figure]
 

@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 
 from actors.evaluation.result_table import GROUPS, ROBOTS
 from dashboards.analysis.aggregate import (
-    METHOD_NAMES,
     Measure,
     Measured,
     Results,
@@ -28,13 +27,12 @@ from dashboards.analysis.aggregate import (
     over_robots,
     success,
 )
+from dashboards.analysis.methods import method_label, method_style
 from dashboards.figures.bar_charts import Panel, Series, draw_bars, draw_lines, legend
 from dashboards.figures.learning_curve import FAILURE_STYLES
 from dashboards.figures.style import MUTED, TEXT, new_figure
 
 FIXED_STYLE, TRANSFER_STYLE = ("#0072B2", "", "o"), ("#E69F00", "////", "s")
-METHOD_STYLES = {"sensor": ("#0072B2", "", "o"), "in": ("#999999", "....", "^"), "out": ("#E69F00", "////", "s")}
-"""Colour, hatch and marker of each method; Okabe and Ito's colours, and grey."""
 HEAT_MAP, NO_CELL = "cividis", "#F0F0F0"
 PANEL_LETTERS = "abcdefgh"
 
@@ -139,11 +137,11 @@ def figure_4_4(results: Results) -> Figure:
 
 def _methods_panel(results: Results, robots: int) -> Panel:
     series = []
-    for method, name in METHOD_NAMES.items():
+    for method in results.methods():
         rates = [measured(results.fixed(method, Setup(robots, groups)), success) for groups in GROUPS]
         printed = PRINTED_OUT.get(robots, {}) if method == "out" else {}
         places = {GROUPS.index(groups): value for groups, value in printed.items()}
-        series.append(Series(name, *METHOD_STYLES[method], rates, places))
+        series.append(Series(method_label(method), *method_style(method)[:3], rates, places))
     return Panel(f"{robots} robots per group", [f"{groups}g" for groups in GROUPS], series)
 
 
@@ -160,9 +158,9 @@ def _two_methods(results: Results, cause: Measure, printed: Printed) -> list[Ser
     places = {ROBOTS.index(robots): value for robots, value in printed.items()}
     series = []
     for method, line in (("sensor", "-"), ("out", "--")):
-        colour, _, marker = METHOD_STYLES[method]
+        colour, _, marker = method_style(method)[:3]
         rates = [over_groups(results, method, robots, cause) for robots in ROBOTS]
-        series.append(Series(METHOD_NAMES[method], colour, line, marker, rates, places if method == "sensor" else {}))
+        series.append(Series(method_label(method), colour, line, marker, rates, places if method == "sensor" else {}))
     return series
 
 
@@ -186,10 +184,11 @@ def _lettered(panels: list[Panel]) -> list[Panel]:
 
 def heatmap(results: Results) -> Figure:
     """Fixed success of every cell in percent, with its 95 % interval below."""
-    figure = new_figure(10.0, 4.0, "Success of all Fixed setups in percent, 95 % intervals below")
-    for axes, (method, name) in zip(figure.subplots(1, len(METHOD_NAMES)), METHOD_NAMES.items(), strict=True):
+    methods = results.methods()
+    figure = new_figure(10.0 * len(methods) / 3, 4.0, "Success of all Fixed setups in percent, 95 % intervals below")
+    for axes, method in zip(figure.subplots(1, len(methods)), methods, strict=True):
         _heat_panel(axes, results, method)
-        axes.set_title(name, loc="left", fontsize=10, color=TEXT)
+        axes.set_title(method_label(method), loc="left", fontsize=10, color=TEXT)
     return figure
 
 

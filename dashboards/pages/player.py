@@ -17,7 +17,8 @@ from actors.evaluation.trajectory import Episode
 from dashboards.pages.assets import OFFLINE, PLAYER_CSS, PLAYER_JS, assets, embedded, fill, packed
 from sim_core.config import WorldConfig
 from sim_core.outcomes import OUTCOME_NAMES, Outcome
-from sim_core.render import GOAL_HALF_SIDE_M, GROUP_COLOURS, view_half_m
+from sim_core.render import GROUP_COLOURS, view_half_m
+from sim_core.scenes.base import GOAL_HALF_SIDE_M
 from sim_core.swarm.flock_rules import STATE_NAMES
 
 INT16_MAX = 32767
@@ -115,19 +116,19 @@ def _scene(config: WorldConfig) -> dict[str, Any]:
         "counts_learner": config.ellipse_counts_learner,
     }
     return {
-        "method": config.method,
-        "robots_per_group": config.robots,
+        "draws_sectors": "sectors" in config.method_class.draws,
+        "group_sizes": list(config.group_sizes),
         "groups": config.groups,
         "sectors": config.sectors,
         "sectors_face_goal": config.sector_frame == "goal",
         "time_step_s": config.time_step_s,
         "view_half_m": view_half_m(config),
-        "arena_radius_m": config.arena_radius_m,
+        "arena_radius_m": config.arena_radius_m if config.scene_class.draws_circle else None,
         "robot_radius_m": config.robot_radius_m,
         "goal_half_m": GOAL_HALF_SIDE_M,
         "inner_radius_m": config.inner_radius_m,
         "outer_radius_m": config.outer_radius_m,
-        "ellipse": None if config.method == "sensor" else ellipse,
+        "ellipse": ellipse if "ellipses" in config.method_class.draws else None,
         "orca": {
             "radius_m": config.orca_radius_m,
             "horizon_s": config.orca_horizon_s,

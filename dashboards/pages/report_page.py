@@ -12,9 +12,9 @@ import html
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from dashboards.analysis.aggregate import METHOD_NAMES
 from dashboards.analysis.claim_checks import Claim
 from dashboards.analysis.claim_text import DETAILS, NOTE, detail_row, evidence, tally
+from dashboards.analysis.methods import in_order, method_label
 from dashboards.pages.assets import OFFLINE, PLAYER_CSS, PLAYER_JS, SERVED, assets, embedded, fill, packed, to_json
 from dashboards.plotly_charts.chart import Chart, Table, as_json, plotly_js
 from dashboards.plotly_charts.result_charts import FAVOURITE
@@ -76,7 +76,7 @@ def report_data(contents: Contents) -> dict[str, Any]:
         "made": contents.made,
         "facts": contents.facts,
         "order": [*FIRST, *(part.key for part in contents.tables if part.key not in FIRST), *LAST],
-        "methods": METHOD_NAMES,
+        "methods": {name: method_label(name) for name in in_order(group.method for group in contents.groups)},
         "favourite": str(FAVOURITE),
         "charts": [as_json(chart) for chart in contents.charts],
         "claims_note": NOTE.replace("\n", " ").replace("*", "").replace("`", ""),

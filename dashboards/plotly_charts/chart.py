@@ -15,9 +15,6 @@ from dashboards.analysis.aggregate import Measured
 
 Figure = dict[str, Any]
 """A Plotly figure: `data` and `layout`."""
-METHOD_COLOURS = {"sensor": "--sensor", "in": "--in", "out": "--out"}
-METHOD_SYMBOLS = {"sensor": "circle", "in": "triangle-up", "out": "square"}
-METHOD_DASHES = {"sensor": "solid", "in": "dot", "out": "dash"}
 FAILURES = {
     "lost": ("--lost", "", "solid", "circle"),
     "captured": ("--captured", "/", "dash", "square"),

@@ -9,7 +9,8 @@ from plotly.colors import sample_colorscale
 
 from actors.evaluation.result_table import GROUPS, ROBOTS
 from actors.evaluation.statistics import as_percent
-from dashboards.analysis.aggregate import METHOD_NAMES, SETUPS, Measured, Results, Setup, measured, success
+from dashboards.analysis.aggregate import SETUPS, Measured, Results, Setup, measured, success
+from dashboards.analysis.methods import in_order, method_label
 from dashboards.plotly_charts.chart import (
     FAILURES,
     Chart,
@@ -47,17 +48,17 @@ def setup_choice(name: str, label: str, setups: list[Setup]) -> Choice:
 
 def method_choice(methods: list[str]) -> Choice:
     """One of some methods."""
-    return Choice("method", "Method", [(method, METHOD_NAMES[method]) for method in methods], methods[0])
+    return Choice("method", "Method", [(method, method_label(method)) for method in methods], methods[0])
 
 
 def heatmaps(presets: Mapping[str, Results]) -> Chart:
     """Fixed success, robots x groups, a map a method."""
     views = {}
     for name, results in presets.items():
-        found = {method: _fixed_rates(results, method) for method in METHOD_NAMES}
-        panels = [Panel(METHOD_NAMES[method], _heatmap(rates)) for method, rates in found.items()]
+        found = {method: _fixed_rates(results, method) for method in results.methods()}
+        panels = [Panel(method_label(method), _heatmap(rates)) for method, rates in found.items()]
         lines = [
-            (METHOD_NAMES[method], f"{robots}r", *(percent_text(rates.get(Setup(robots, m))) for m in GROUPS))
+            (method_label(method), f"{robots}r", *(percent_text(rates.get(Setup(robots, m))) for m in GROUPS))
             for method, rates in found.items()
             for robots in ROBOTS
         ]
@@ -120,7 +121,8 @@ def _luminance(share: float) -> float:
 
 def transfers(presets: Mapping[str, Results]) -> Chart:
     """Policies trained in one setup and tested in others, beside those trained there."""
-    methods = [m for m in METHOD_NAMES if any(results.fixed_present(m) for results in presets.values())]
+    known = in_order(method for results in presets.values() for method in results.methods())
+    methods = [m for m in known if any(results.fixed_present(m) for results in presets.values())]
     setups = [s for s in SETUPS if any(results.fixed(m, s) for m in methods for results in presets.values())]
     views = {}
     for name, results in presets.items():
@@ -183,12 +185,14 @@ def failure_causes(presets: Mapping[str, Results]) -> Chart:
     """Why Fixed episodes fail, a bar a setup."""
     views = {}
     for name, results in presets.items():
-        found = {method: _failure_shares(results, method) for method in METHOD_NAMES if results.fixed_present(method)}
+        found = {
+            method: _failure_shares(results, method) for method in results.methods() if results.fixed_present(method)
+        }
         failed = [sum(rate.estimate.value for rate in row.values()) for rows in found.values() for row in rows.values()]
         axis = share_axis(min(max([0.05, *failed]), 1.0))
-        panels = [Panel(METHOD_NAMES[method], _failure_figure(rows, axis), wide=True) for method, rows in found.items()]
+        panels = [Panel(method_label(method), _failure_figure(rows, axis), wide=True) for method, rows in found.items()]
         lines = [
-            (METHOD_NAMES[method], str(setup), *(percent_text(rate) for rate in row.values()))
+            (method_label(method), str(setup), *(percent_text(rate) for rate in row.values()))
             for method, rows in found.items()
             for setup, row in rows.items()
         ]

@@ -7,13 +7,11 @@ from statistics import median
 from typing import NamedTuple
 
 from actors.evaluation.statistics import Estimate, as_percent
-from dashboards.analysis.aggregate import METHOD_NAMES, Setup
+from dashboards.analysis.aggregate import Setup
+from dashboards.analysis.methods import in_order, method_label, method_style
 from dashboards.figures.learning_curve import CurvePoint
 from dashboards.plotly_charts.chart import (
     FAILURES,
-    METHOD_COLOURS,
-    METHOD_DASHES,
-    METHOD_SYMBOLS,
     Chart,
     Figure,
     Panel,
@@ -59,7 +57,7 @@ def setup_curves(trainings: Sequence[Training]) -> Chart:
     for training in trainings:
         if training.setup is not None and training.curve:
             by_setup.setdefault(training.setup, []).append(training)
-    order = list(METHOD_NAMES)
+    order = in_order(training.method for training in trainings)
     views = {}
     for setup in sorted(by_setup):
         found = sorted(by_setup[setup], key=lambda training: (order.index(training.method), training.seed))
@@ -93,8 +91,9 @@ def _steps_axis() -> dict[str, object]:
 
 
 def _curve_traces(training: Training) -> list[dict[str, object]]:
-    colour = METHOD_COLOURS.get(training.method, "--sensor")
-    name = f"{METHOD_NAMES[training.method]} seed {training.seed}" if training.method else "mean return"
+    style = method_style(training.method or "sensor")
+    colour = style.css_colour
+    name = f"{method_label(training.method)} seed {training.seed}" if training.method else "mean return"
     steps = [point.env_steps for point in training.curve]
     edge = {"type": "scatter", "mode": "lines", "x": steps, "line": {"width": 0}, "hoverinfo": "skip"}
     low = {**edge, "y": [point.low for point in training.curve], "showlegend": False, "legendgroup": training.name}
@@ -108,8 +107,8 @@ def _curve_traces(training: Training) -> list[dict[str, object]]:
         "y": [point.value for point in training.curve],
         "customdata": [_value_text(point, training.is_share) for point in training.curve],
         "hovertemplate": "%{customdata}",
-        "line": {"color": colour, "width": 2, "dash": METHOD_DASHES.get(training.method, "solid")},
-        "marker": {"color": colour, "size": 5, "symbol": METHOD_SYMBOLS.get(training.method, "circle")},
+        "line": {"color": colour, "width": 2, "dash": style.dash},
+        "marker": {"color": colour, "size": 5, "symbol": style.symbol},
     }
     return [low, high, line]
 
@@ -179,19 +178,20 @@ def _range(training: Training) -> tuple[float, float]:
 
 def _speeds_by_robots(trainings: Sequence[Training]) -> Figure:
     traces = []
-    for method, name in METHOD_NAMES.items():
+    for method in in_order(training.method for training in trainings if training.method):
+        style = method_style(method)
         own = [training for training in trainings if training.method == method]
         if own:
             traces.append(
                 {
                     "type": "scatter",
                     "mode": "markers",
-                    "name": name,
+                    "name": method_label(method),
                     "x": [t.setup.robots * t.setup.groups for t in own if t.setup is not None],
                     "y": [_middle(training) for training in own],
                     "text": [training.name for training in own],
                     "hovertemplate": "%{text}: %{y:,.0f} env steps/s<extra></extra>",
-                    "marker": {"color": METHOD_COLOURS[method], "symbol": METHOD_SYMBOLS[method], "size": 9},
+                    "marker": {"color": style.css_colour, "symbol": style.symbol, "size": 9},
                 }
             )
     axes = {"type": "log", "fixedrange": True, "tickmode": "array", "tickvals": TICKS}

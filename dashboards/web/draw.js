@@ -47,8 +47,10 @@ function draw() {
   pxPerM = zoom * size / (2 * data.view_half_m);
   centre.x = show.follow ? positionOf(data.learner, 0) : 0;
   centre.y = show.follow ? positionOf(data.learner, 1) : 0;
-  circle(toX(0), toY(0), data.arena_radius_m * pxPerM);
-  stroke(theme.arena, 1.5);
+  if (data.arena_radius_m !== null) {
+    circle(toX(0), toY(0), data.arena_radius_m * pxPerM);
+    stroke(theme.arena, 1.5);
+  }
   data.goals.forEach(drawGoal);
   if (show.sensing) drawSensing();
   if (show.ellipses && data.ellipse) for (let group = 0; group < data.groups; group++) drawEllipse(group);
@@ -92,7 +94,7 @@ function drawSensing() {
     stroke(theme.sensing, 1);
     context.globalAlpha = 1;
   }
-  if (data.method === "sensor") drawSectors(x, y, outer);
+  if (data.draws_sectors) drawSectors(x, y, outer);
   const action = actions[Math.floor(step)];
   if (action >= 0 && action < data.sectors) drawHeading(x, y, inner, headingOf(action));
 }
@@ -134,9 +136,9 @@ function drawHeading(x, y, inner, turn) {
 
 // A group's ellipse as sim_core/methods/ellipse.py has it: centre, half-axes and the angle of the larger one.
 function ellipseOf(group) {
-  const robots = [], first = group * data.robots_per_group;
-  for (let robot = first; robot < first + data.robots_per_group; robot++) {
-    if (robot !== data.learner || data.ellipse.counts_learner) robots.push(robot);
+  const robots = [];
+  for (let robot = 0; robot < numRobots; robot++) {
+    if (groupOf(robot) === group && (robot !== data.learner || data.ellipse.counts_learner)) robots.push(robot);
   }
   const mean = values => values.reduce((sum, value) => sum + value, 0) / robots.length;
   const xs = robots.map(robot => positionOf(robot, 0)), ys = robots.map(robot => positionOf(robot, 1));

@@ -5,7 +5,7 @@ const canvas = element("canvas"), context = canvas.getContext("2d");
 const ARROW_S = 0.6;  // an arrow ends where the robot would be after this time
 const show = {sensing: true, ellipses: true, velocity: false, machine: false, planes: false, follow: false};
 let data = null;     // the episode as dashboards/pages/player.py gives it
-let numRobots = 0, learnerGroup = 0, positions = null, machine = null, actions = null;
+let groupOfRobot = [], numRobots = 0, learnerGroup = 0, positions = null, machine = null, actions = null;
 let selected = 0;    // the robot whose ORCA lines are shown
 let step = 0;        // fractional while playing
 let playing = false;
@@ -29,7 +29,8 @@ async function load(next) {
   const taken = new Int8Array((await inflate(next.actions)).buffer);
   setPlaying(false);
   data = next;
-  numRobots = data.robots_per_group * data.groups;
+  groupOfRobot = data.group_sizes.flatMap((size, group) => Array(size).fill(group));
+  numRobots = groupOfRobot.length;
   learnerGroup = groupOf(data.learner);
   positions = decodePositions(planes);
   machine = states;
@@ -45,7 +46,7 @@ async function load(next) {
   seek(0);
 }
 
-function groupOf(robot) { return Math.floor(robot / data.robots_per_group); }
+function groupOf(robot) { return groupOfRobot[robot]; }
 function groupColour(group) { return data.colours[group % data.colours.length]; }
 function coordinate(atStep, robot, axis) { return positions[(atStep * numRobots + robot) * 2 + axis]; }
 
@@ -127,7 +128,7 @@ function buildLegends() {
   for (const list of ["groups", "states"]) element(list).replaceChildren();
   for (let group = 0; group < data.groups; group++) {
     const disc = drawing({r: 6.5, fill: groupColour(group), stroke: "var(--edge)"});
-    addRow(element("groups"), disc, "Group " + (group + 1), data.robots_per_group + " robots");
+    addRow(element("groups"), disc, "Group " + (group + 1), data.group_sizes[group] + " robots");
   }
   const ringed = drawing({r: 9, fill: "var(--halo)"}, {r: 8.4, fill: "#000000"},
     {r: 7.4, fill: groupColour(learnerGroup)}, {r: 4.4, fill: "#000000"});

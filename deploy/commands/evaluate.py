@@ -66,7 +66,7 @@ def _baseline_entry(command: Evaluate) -> Entry:
     method = command.method or "sensor"
     default = preset_config(command.preset, method).world if command.preset else WorldConfig(method=method)
     world = _on_setup(default, command)
-    title = f"{baseline}, {world.method} {world.setup}"
+    title = f"{baseline}, {world.method_name} {world.setup}"
     return Entry(EnvSpec(ENV_ID, world), baseline, str(baseline), 0, title)
 
 
@@ -85,7 +85,7 @@ def _run_entry(command: Evaluate) -> Entry:
     )
     config = dataclasses.replace(config, world=_on_setup(config.world, command))
     weights = find_policy(folder, config, command.checkpoint)
-    title = f"{config.world.method} {config.world.setup}" if config.env.is_swarm else config.env_id
+    title = f"{config.world.method_name} {config.world.setup}" if config.env.is_swarm else config.env_id
     return Entry(config.env, weights, folder.path.name, weights.version, title)
 
 
@@ -142,7 +142,7 @@ def _watch_swarm(config: RunConfig, weights: WeightsSnapshot, command: Watch, ar
     episode = record_episode(config.env, weights, command.seed)
     save_episodes(store, [episode], config.world)
     if command.format == "html":
-        write_player(store, path, f"{config.world.method} {config.world.setup}")
+        write_player(store, path, f"{config.world.method_name} {config.world.setup}")
     elif command.format == "mp4":
         write_video(store, path)
     else:

@@ -19,9 +19,9 @@ from learner.checkpoints.manifest import MANIFEST
 from learner.checkpoints.store import FolderStore
 from learner.config import RunConfig, config_hash, to_dict
 from learner.export.policy_file import read_policy, read_saved_policy
-from learner.export.ports import FRAME, Port, bare_inputs, bare_outputs, robot_inputs, robot_outputs
+from learner.export.ports import FRAME, Port, bare_inputs, bare_outputs
 from learner.export.reference_states import Sensed, observed_states, swarm_states
-from learner.export.robot_policy import BarePolicy, make_robot
+from learner.export.robot_module import BarePolicy, make_robot, robot_class
 from learner.export.write import Agreement, check_packages, write_export
 from learner.run_folder import RunFolder, find_run
 from learner.tracking.mlflow_run import git_commit
@@ -77,13 +77,14 @@ def _parts(command: Export, config: RunConfig, weights: WeightsSnapshot) -> _Par
         return _Parts(BarePolicy(network), bare_inputs(shape), bare_outputs(shape), states)
     world = config.world
     states = swarm_states(world, weights, weights, command.first_seed, command.states)
-    return _Parts(make_robot(network, world), robot_inputs(world), robot_outputs(world), states)
+    robot = make_robot(network, world)
+    return _Parts(robot, robot.inputs(world), robot.outputs(world), states)
 
 
 def metadata(config: RunConfig, weights: WeightsSnapshot, bare: bool) -> dict[str, Any]:
     """What an exported file says of itself, beside its inputs and outputs."""
     world = config.world
-    robot = {} if bare else {"method": world.method, "setup": world.setup, "frame": FRAME}
+    robot = {} if bare else {"method": world.method_name, "setup": world.setup, "frame": FRAME}
     timing = {} if bare else {"time_step_s": world.time_step_s, "outer_radius_m": world.outer_radius_m}
     origin = {"run": config.name, "config_hash": config_hash(config), "updates": weights.version}
     settings = {"commit": git_commit(), "settings": to_dict(config)}
@@ -103,6 +104,8 @@ def export(command: Export) -> int:
         config.env.is_swarm or command.bare,
         f"what a robot senses in {config.env_id} is not known; export observation to action values with --bare True",
     )
+    if not command.bare:
+        robot_class(config.world)  # refuses a method that has none
     out = command.out or folder.artifacts / ("export-bare" if command.bare else "export")
     make_folder(out.absolute().parent, "--out")
     parts = _parts(command, config, weights)

@@ -109,7 +109,7 @@ class SweepResults:
 
     def _write_settings(self) -> None:
         trained = [cell.config for cell in self.cells if cell.policy == LEARNED]
-        examples = {config.world.method: to_dict(config) for config in reversed(trained)}
+        examples = {config.world.method_name: to_dict(config) for config in reversed(trained)}
         sittings = [sitting._asdict() for sitting in self._sittings]
         settings = {
             "sweep": dataclasses.asdict(self._grid),

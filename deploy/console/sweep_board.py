@@ -155,7 +155,7 @@ class LiveBoard(SweepBoard):
 
 def _kind(cell: Cell) -> str:
     """What stands in a row of the table: a method, or a baseline in a method's world."""
-    method = cell.config.world.method
+    method = cell.config.world.method_name
     return method if cell.policy == LEARNED else f"{cell.policy}, {method}"
 
 

@@ -10,7 +10,6 @@ from tyro.conf import Positional, UseCounterAction, arg
 
 from learner.presets import PresetName
 from sim_core.checks import require
-from sim_core.config import MethodName
 
 Switch = Annotated[UseCounterAction[int], arg(help_behavior_hint="(off by default)")]
 """A flag without a value: 0 unless it is given."""
@@ -39,7 +38,7 @@ class Evaluate:
     """Episodes to play."""
     first_seed: int = 2_000_000_000
     """Seed of the first episode; the others count on."""
-    method: MethodName | None = None
+    method: str | None = None
     """Baselines only: method of the world to play in; sensor by default."""
     preset: PresetName | None = None
     """Baselines only: settings of the world to play in, those of `shoal sweep`; the defaults otherwise."""

@@ -12,7 +12,8 @@ from actors.evaluation.result_table import LEARNED, ResultRow, read_table
 from actors.evaluation.trajectory import Episode, load_episodes
 from actors.policy.baselines import Baseline
 from actors.policy.network import WeightsSnapshot
-from dashboards.analysis.aggregate import METHOD_NAMES, Setup
+from dashboards.analysis.aggregate import Setup
+from dashboards.analysis.methods import in_order
 from dashboards.pages.assets import to_json
 from dashboards.pages.player import player_data
 from dashboards.pages.report_page import EpisodeGroup
@@ -91,7 +92,7 @@ class SweepShelf:
 
 def _order(row: ResultRow) -> tuple[object, ...]:
     trained, played = (row.trained_robots, row.trained_groups), (row.robots, row.groups)
-    method = list(METHOD_NAMES).index(row.method)
+    method = in_order([row.method]).index(row.method), row.method
     return row.preset, row.policy != LEARNED, row.policy, method, trained, row.seed, trained != played, played
 
 
@@ -137,7 +138,7 @@ class RunShelf:
             self._weights, self._seeds = weights, self._play(weights)
         world, counts = self._config.world, {name: len(found) for name, found in self._seeds.items()}
         policy, seed = f"of update {weights.version:,}", str(self._config.seed)
-        return [EpisodeGroup(NEWEST, "", policy, world.method, world.setup, seed, world.setup, counts)]
+        return [EpisodeGroup(NEWEST, "", policy, world.method_name, world.setup, seed, world.setup, counts)]
 
     def _play(self, weights: WeightsSnapshot) -> dict[str, list[int]]:
         """Seeds of the episodes by outcome."""
@@ -187,7 +188,7 @@ class RecordedShelf:
 def _recorded(name: str, episodes: list[Episode], world: WorldConfig) -> EpisodeGroup:
     ends = [OUTCOME_NAMES[episode.outcome] for episode in episodes]
     counts = {end: ends.count(end) for end in dict.fromkeys(ends)}
-    return EpisodeGroup(name, "", f"recorded: {name}", world.method, NOT_KNOWN, NOT_KNOWN, world.setup, counts)
+    return EpisodeGroup(name, "", f"recorded: {name}", world.method_name, NOT_KNOWN, NOT_KNOWN, world.setup, counts)
 
 
 class Shelves:

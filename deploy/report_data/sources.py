@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 
 from actors.evaluation.result_table import ResultRow, read_table
 from actors.evaluation.statistics import rate
-from dashboards.analysis.aggregate import METHOD_NAMES, NUM_CELLS, Results, Setup
+from dashboards.analysis.aggregate import CELLS_PER_METHOD, Results, Setup
 from dashboards.analysis.claim_text import tally
 from dashboards.analysis.claims import judge
 from dashboards.figures.learning_curve import CurvePoint
@@ -228,7 +228,7 @@ def _training(folder: RunFolder) -> Training:
     world = config.world
     setup = Setup(world.robots, world.groups) if config.env.is_swarm else None
     is_share = all(point.failures is not None for point in curve)
-    method = world.method if config.env.is_swarm else ""
+    method = world.method_name if config.env.is_swarm else ""
     return Training(config.name, method, setup, config.seed, curve, speeds, is_share)
 
 
@@ -249,8 +249,8 @@ def _final_point(folder: RunFolder, config: RunConfig) -> list[CurvePoint]:
 def _coverage(presets: dict[str, Results]) -> list[tuple[str, str]]:
     facts = []
     for name, results in presets.items():
-        fixed = sum(len(results.fixed_present(method)) for method in METHOD_NAMES)
-        facts.append((f"cells, {name}", f"{fixed} of {NUM_CELLS}"))
+        fixed = sum(len(results.fixed_present(method)) for method in results.methods())
+        facts.append((f"cells, {name}", f"{fixed} of {CELLS_PER_METHOD * len(results.methods())}"))
     episodes = sum(cell.episodes for results in presets.values() for cell in results.cells())
     return [*facts, ("episodes counted", f"{episodes:,}")] if presets else facts
 

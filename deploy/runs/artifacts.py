@@ -70,7 +70,7 @@ def _curve(folder: RunFolder, config: RunConfig, rows: list[Row]) -> Path:
     path = folder.artifacts / "learning_curve.png"
     points = curve_points(rows)
     is_share = points[0].failures is not None
-    title = f"{config.world.method} {config.world.setup}" if config.env.is_swarm else config.env_id
+    title = f"{config.world.method_name} {config.world.setup}" if config.env.is_swarm else config.env_id
     learning_curve_png(points, path, title, "success rate" if is_share else "mean return", is_share)
     return path
 
@@ -79,7 +79,7 @@ def _swarm_animation(folder: RunFolder, config: RunConfig, weights: WeightsSnaps
     episode = _first_success(config, weights)
     store, page = folder.artifacts / "episode.zarr", folder.artifacts / "episode.html"
     save_episodes(store, [episode], config.world)
-    write_player(store, page, f"{config.world.method} {config.world.setup}")
+    write_player(store, page, f"{config.world.method_name} {config.world.setup}")
     return [store, page]
 
 

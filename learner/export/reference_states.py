@@ -1,4 +1,4 @@
-"""What a robot of `robot_policy` senses in states of real rollouts, and what the simulator decides there.
+"""What a robot of `robot_module` senses in states of real rollouts, and what the simulator decides there.
 
 This is the other side of the comparison that every export passes: the simulator's own perception, the numpy
 policy that rollout workers act with, and the simulator's velocity.
@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.evaluation.evaluator import Candidate, make_player
+from actors.evaluation.evaluator import Candidate, make_action_rule
 from actors.policy.network import Policy, WeightsSnapshot
 from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
+from learner.export.robot_module import robot_class
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig
 from sim_core.worlds import WorldBatch, is_done
@@ -29,35 +30,6 @@ class Sensed(NamedTuple):
 
     inputs: dict[str, NDArray[Any]]
     expected: dict[str, NDArray[Any]]
-
-
-def relative_inputs(worlds: WorldBatch) -> dict[str, NDArray[Any]]:
-    """What the learning robots of a batch of worlds sense, as the inputs of `learner.export.robot_policy`.
-
-    In the own group the place of the robot itself is masked.
-    """
-    config, learner = worlds.config, worlds.state.learner
-    rows = np.arange(worlds.num_worlds)
-    positions = worlds.positions()
-    itself = positions[rows, learner]
-    relative = (positions - itself[:, None]).reshape(-1, config.groups, config.robots, 2)
-    mask = np.ones(relative.shape[:3], np.bool_)
-    mask[rows, learner // config.robots, learner % config.robots] = False
-    order = (learner[:, None] // config.robots + np.arange(config.groups)) % config.groups  # the own group first
-    relative, mask = (np.take_along_axis(x, _wide(order, x.ndim), axis=1) for x in (relative, mask))
-    if config.method == "sensor":
-        return {
-            "own": relative[:, 0],
-            "own_mask": mask[:, 0],
-            "other": relative[:, 1:].reshape(len(rows), -1, 2),
-            "other_mask": mask[:, 1:].reshape(len(rows), -1),
-        }
-    goals = worlds.goals() - itself[:, None]
-    return {"positions": relative, "mask": mask, "goals": np.take_along_axis(goals, _wide(order, 3), axis=1)}
-
-
-def _wide(order: NDArray[Any], dimensions: int) -> NDArray[Any]:
-    return order.reshape(*order.shape, *(1,) * (dimensions - 2))
 
 
 def swarm_states(config: WorldConfig, driver: Candidate, weights: WeightsSnapshot, seed: int, count: int) -> Sensed:
@@ -77,13 +49,14 @@ def swarm_states(config: WorldConfig, driver: Candidate, weights: WeightsSnapsho
     size = min(MAX_WORLDS, count)
     seeds = list(range(seed, seed + size))
     worlds, policy = WorldBatch(config, size), Policy(weights)
-    player = make_player(EnvSpec(ENV_ID, config), driver, seeds)
+    robot = robot_class(config)
+    rule = make_action_rule(EnvSpec(ENV_ID, config), driver, seeds)
     worlds.seed(seeds)
     observation, taken = worlds.reset(), list[Sensed]()
     for step in range(EVERY_STEPS * -(-count // size)):
         if step % EVERY_STEPS == 0:
-            taken.append(Sensed(relative_inputs(worlds), _decided(worlds, policy, observation)))
-        result = worlds.step(player.act(observation))
+            taken.append(Sensed(robot.sense(worlds), _decided(worlds, policy, observation)))
+        result = worlds.step(rule.act(observation))
         done = is_done(result.outcome)
         observation = worlds.reset(done) if done.any() else result.observation
     return _joined(taken, count)

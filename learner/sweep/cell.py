@@ -75,7 +75,7 @@ def result_row(sweep: SweepConfig, cell: Cell, played: WorldConfig, stats: Episo
     return ResultRow(
         preset=sweep.label,
         policy=cell.policy,
-        method=played.method,
+        method=played.method_name,
         trained_robots=config.world.robots,
         trained_groups=config.world.groups,
         seed=config.seed,

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, cast, get_args
 
 from actors.evaluation.result_table import GROUPS, LEARNED, ROBOTS, ResultRow
-from learner.config import WHERE, RunConfig, to_dict
+from learner.config import WHERE, RunConfig, identity_dict, to_dict
 from learner.presets import PresetName, preset_config
 from sim_core.checks import ConfigError, check_fields, require
-from sim_core.config import MethodName, WorldConfig
+from sim_core.config import WorldConfig
+from sim_core.plugins import METHODS, load, read_source, short_name
 
 BaselineName = Literal["fl-orca", "greedy", "random"]
 
@@ -30,8 +31,8 @@ class SweepConfig:
 
     preset: PresetName = "thesis"
     """Settings of every training: the text's reading, or our best."""
-    methods: tuple[MethodName, ...] = ("sensor", "in", "out")
-    """State representations."""
+    methods: tuple[str, ...] = ("sensor", "in", "out")
+    """State representations: names, or FILE.py:CLASS."""
     set: tuple[str, ...] = ()
     """Settings in place of the preset's, as NAME=VALUE: any field of `shoal train`, for calibration."""
     robots: tuple[int, ...] = ROBOTS
@@ -62,12 +63,15 @@ class SweepConfig:
             some = isinstance(values, tuple) and (len(values) > 0 or name == "baselines")
             require(some, f"{name} must have at least one value")
             require(len(set(values)) == len(values), f"{name} must not repeat a value, as in {values}")
-        for name, known in (("methods", get_args(MethodName)), ("baselines", get_args(BaselineName))):
-            given = getattr(self, name)
-            require(
-                all(value in known for value in given),
-                f"{name} must be among {', '.join(known)}, not {given}",
-            )
+        rules = get_args(BaselineName)
+        require(
+            all(value in rules for value in self.baselines),
+            f"baselines must be among {', '.join(rules)}, not {self.baselines}",
+        )
+        for method in self.methods:
+            load(METHODS, *read_source(METHODS, method))
+        names = [short_name(METHODS, method) for method in self.methods]
+        require(len(set(names)) == len(names), f"methods must have different names, not {', '.join(names)}")
         for name in ("episodes", "extrapolation_episodes", "baseline_episodes", "env_steps"):
             value = getattr(self, name)
             require(value is None or value >= 1, f"{name} must be at least 1, not {value}")
@@ -82,7 +86,8 @@ class SweepConfig:
 
 
 NOT_SET = (
-    "world seed engine device method robots groups env_id total_env_steps final_eval_episodes final_eval_first_seed"
+    "world seed engine device method method_source scene_source robots groups env_id total_env_steps "
+    "final_eval_episodes final_eval_first_seed"
 ).split()
 """Settings that the grid itself decides."""
 
@@ -123,7 +128,7 @@ class Cell(NamedTuple):
     def name(self) -> str:
         """What people call it, such as `sensor 10r×2g s0` or `greedy: sensor 10r×2g`."""
         world = self.config.world
-        return self.config.name if self.policy == LEARNED else f"{self.policy}: {world.method} {world.setup}"
+        return self.config.name if self.policy == LEARNED else f"{self.policy}: {world.method_name} {world.setup}"
 
     @property
     def weight(self) -> float:
@@ -145,15 +150,16 @@ def cell_hash(config: RunConfig) -> str:
     settings or other defaults. A test holds the presets against the settings of committed results.
     """
     defaults = to_dict(RunConfig()) | FIRST_DEFAULTS
-    world = {name: value for name, value in to_dict(config)["world"].items() if value != defaults["world"][name]}
-    run = {name: value for name, value in to_dict(config).items() if value != defaults[name]}
+    given = identity_dict(config)
+    world = {name: value for name, value in given["world"].items() if value != defaults["world"][name]}
+    run = {name: value for name, value in given.items() if value != defaults[name]}
     values = {**run, "world": world}
     for name in WHERE:
         values.pop(name, None)
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def make_cell(sweep: SweepConfig, method: MethodName, robots: int, groups: int, seed: int) -> Cell:
+def make_cell(sweep: SweepConfig, method: str, robots: int, groups: int, seed: int) -> Cell:
     """The cell of one method, setup and seed.
 
     Raises:
@@ -177,7 +183,8 @@ def make_cell(sweep: SweepConfig, method: MethodName, robots: int, groups: int, 
     prioritised = run.get("replay") == "prioritised"  # else the default stays, with which cells have their names
     scheduled = {"importance_exponent_env_steps": env_steps} if prioritised else {}
     config = dataclasses.replace(config, **{**scheduled, **run})
-    return Cell(f"{method}-{robots}r{groups}g-s{seed}-{cell_hash(config)}", config)
+    name = config.world.method_name
+    return Cell(f"{name}-{robots}r{groups}g-s{seed}-{cell_hash(config)}", config)
 
 
 def sweep_of_label(label: str) -> SweepConfig:
@@ -190,7 +197,7 @@ def sweep_of_label(label: str) -> SweepConfig:
     return SweepConfig(preset=cast(PresetName, preset), set=tuple(changed))
 
 
-def world_of_label(label: str, method: MethodName, robots: int, groups: int) -> WorldConfig:
+def world_of_label(label: str, method: str, robots: int, groups: int) -> WorldConfig:
     """The world in which a sweep of this label plays.
 
     Where there is none, because its settings do not fit this method and setup or the label is no sweep's, that of its
@@ -207,8 +214,9 @@ def world_of_label(label: str, method: MethodName, robots: int, groups: int) -> 
 def expected_hash(sweep: SweepConfig, row: ResultRow) -> str | None:
     """The hash of the cell whose row this would be with the sweep's settings; None if the sweep could not have it."""
     setup = (row.trained_robots, row.trained_groups)
+    known = {short_name(METHODS, method): method for method in sweep.methods}
     try:
-        method = cast(MethodName, row.method)
+        method = known.get(row.method, row.method)
         if row.policy == LEARNED:
             return cell_hash(make_cell(sweep, method, *setup, row.seed).config)
         return cell_hash(make_baseline_cell(sweep, cast(BaselineName, row.policy), method, *setup).config)
@@ -228,9 +236,7 @@ def make_cells(sweep: SweepConfig) -> list[Cell]:
     return [cell for part in parts for cell in sorted(part, key=lambda cell: cell.weight)]
 
 
-def make_baseline_cell(
-    sweep: SweepConfig, baseline: BaselineName, method: MethodName, robots: int, groups: int
-) -> Cell:
+def make_baseline_cell(sweep: SweepConfig, baseline: BaselineName, method: str, robots: int, groups: int) -> Cell:
     """The cell of a baseline in the world that the preset gives a method in one setup.
 
     Raises:
@@ -238,18 +244,19 @@ def make_baseline_cell(
     """
     trained = make_cell(sweep, method, robots, groups, 0).config
     config = dataclasses.replace(trained, final_eval_episodes=sweep.baseline_episodes)
-    return Cell(f"{baseline}-{method}-{robots}r{groups}g-{cell_hash(config)}", config, baseline)
+    name = config.world.method_name
+    return Cell(f"{baseline}-{name}-{robots}r{groups}g-{cell_hash(config)}", config, baseline)
 
 
 def _other_setups(sweep: SweepConfig, cell: Cell) -> list[tuple[int, int]]:
     """(robots, groups) of the other setups in which a cell's policy is evaluated (Extrapolation).
 
-    M_sensor's state has the same size in all; that of M_IN and M_OUT has a row a group, so groups stay.
+    Where a method's state depends on the number of groups, as that of M_IN and M_OUT, groups stay.
     """
     world = cell.config.world
     if sweep.extrapolation == "none" or cell.policy != LEARNED:
         return []
-    groups = sweep.groups if world.method == "sensor" else (world.groups,)
+    groups = sweep.groups if world.method_class.fits_any_groups else (world.groups,)
     return [(r, g) for r in sweep.robots for g in groups if (r, g) != (world.robots, world.groups)]
 
 

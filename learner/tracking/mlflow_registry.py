@@ -29,7 +29,11 @@ SCORE = "score"
 def model_name(config: RunConfig) -> str:
     """Name of the registered model of a run's setup."""
     world = config.world
-    return f"{world.method}-{world.robots}r-{world.groups}g" if config.env.is_swarm else config.env_id.replace("/", "-")
+    return (
+        f"{world.method_name}-{world.robots}r-{world.groups}g"
+        if config.env.is_swarm
+        else config.env_id.replace("/", "-")
+    )
 
 
 def register_policy(client: MlflowClient, config: RunConfig, run_id: str, logged: ModelInfo, score: float) -> None:

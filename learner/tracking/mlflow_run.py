@@ -115,7 +115,7 @@ class Tracker:
     def start(self, config: RunConfig, tags: dict[str, str] | None = None) -> None:
         """Creates the run, with the whole config as params and, with `tags`, what a user filters by as tags."""
         known = {
-            "method": config.world.method if config.env.is_swarm else "none",
+            "method": config.world.method_name if config.env.is_swarm else "none",
             "robots": str(config.world.robots),
             "groups": str(config.world.groups),
             "seed": str(config.seed),

@@ -28,7 +28,6 @@ NOBODY = -1
 class EllipseParams(NamedTuple):
     """Constants of a group's ellipse."""
 
-    robots: int
     full: bool
     axis_scale: float
     smallest_m: float
@@ -39,7 +38,6 @@ def ellipse_params(config: WorldConfig) -> EllipseParams:
     """The constants of `config`; half-axes are `axis_scale` standard deviations."""
     scale = math.sqrt(config.ellipse_chi_square)
     return EllipseParams(
-        robots=config.robots,
         full=config.ellipse_covariance == "full",
         axis_scale=scale if config.ellipse_axes == "confidence" else scale / 2,
         smallest_m=float(config.ellipse_smallest_half_axis_m),
@@ -48,21 +46,21 @@ def ellipse_params(config: WorldConfig) -> EllipseParams:
 
 
 @kernel
-def group_centre(group, robots, pos_x, pos_y, left_out):
-    """(x_c, y_c, n): mean position of a group's robots but `left_out` (Eq. 4.5 and 4.6), metres, and their number."""
+def group_centre(begin, end, pos_x, pos_y, left_out):
+    """(x_c, y_c, n): mean position of robots begin..end-1 but `left_out`, metres, and their number (Eq. 4.5, 4.6)."""
     x, y, count = 0.0, 0.0, 0
-    for i in range(group * robots, (group + 1) * robots):
+    for i in range(begin, end):
         if i != left_out:
             x, y, count = x + pos_x[i], y + pos_y[i], count + 1
     return x / count, y / count, count
 
 
 @kernel
-def group_covariance(group, robots, pos_x, pos_y, left_out):
-    """(x_c, y_c, sigma_x^2, sigma_xy, sigma_y^2) of a group's robots but `left_out`; all 0 with one robot."""
-    x_c, y_c, count = group_centre(group, robots, pos_x, pos_y, left_out)
+def group_covariance(begin, end, pos_x, pos_y, left_out):
+    """(x_c, y_c, sigma_x^2, sigma_xy, sigma_y^2) of robots begin..end-1 but `left_out`; all 0 with one robot."""
+    x_c, y_c, count = group_centre(begin, end, pos_x, pos_y, left_out)
     xx, xy, yy = 0.0, 0.0, 0.0
-    for i in range(group * robots, (group + 1) * robots):
+    for i in range(begin, end):
         if i != left_out:
             dx, dy = pos_x[i] - x_c, pos_y[i] - y_c
             xx, xy, yy = xx + dx * dx, xy + dx * dy, yy + dy * dy
@@ -83,9 +81,9 @@ def principal_axes(xx, xy, yy):
 
 
 @kernel
-def group_ellipse(group, pos_x, pos_y, left_out, p):
-    """(a, b, x_c, y_c, theta) of a group's robots but `left_out`; metres, radians. `p`: EllipseParams."""
-    x_c, y_c, xx, xy, yy = group_covariance(group, p.robots, pos_x, pos_y, left_out)
+def group_ellipse(begin, end, pos_x, pos_y, left_out, p):
+    """(a, b, x_c, y_c, theta) of robots begin..end-1 but `left_out`; metres, radians. `p`: EllipseParams."""
+    x_c, y_c, xx, xy, yy = group_covariance(begin, end, pos_x, pos_y, left_out)
     largest, smallest, theta = principal_axes(xx, xy if p.full else 0.0, yy)
     a = max(p.axis_scale * math.sqrt(smallest), p.smallest_m)
     b = max(p.axis_scale * math.sqrt(largest), p.smallest_m)
@@ -108,7 +106,7 @@ def left_out_of(learner, p):
 
 
 @kernel
-def in_own_ellipse(learner, pos_x, pos_y, p):
-    """Whether the learning robot lies in its group's ellipse. `p`: EllipseParams."""
-    a, b, x_c, y_c, theta = group_ellipse(learner // p.robots, pos_x, pos_y, left_out_of(learner, p), p)
+def in_own_ellipse(learner, begin, end, pos_x, pos_y, p):
+    """Whether the learning robot lies in the ellipse of its group, robots begin..end-1. `p`: EllipseParams."""
+    a, b, x_c, y_c, theta = group_ellipse(begin, end, pos_x, pos_y, left_out_of(learner, p), p)
     return in_ellipse(pos_x[learner], pos_y[learner], a, b, x_c, y_c, theta)

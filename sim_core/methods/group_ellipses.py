@@ -12,15 +12,16 @@ this, the collision and the goal as terminal. The row "Lost" of Table 4.1 is rea
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_core.config import WorldConfig, start_grid_radius_m
+from sim_core.checks import require
+from sim_core.config import WorldConfig
 from sim_core.jit import kernel
 from sim_core.methods.apf import FieldParams, field_of, field_params
-from sim_core.methods.base import Method
+from sim_core.methods.base import EpisodeParams, GreedyRule, Method, Preset, episode_params
 from sim_core.methods.ellipse import (
     NOBODY,
     EllipseParams,
@@ -30,10 +31,12 @@ from sim_core.methods.ellipse import (
     in_own_ellipse,
     left_out_of,
 )
+from sim_core.methods.headings import heading_velocities
+from sim_core.methods.m_sensor import WORLD as SWARM_WORLD
 from sim_core.methods.progress import came_closer
 from sim_core.outcomes import Outcome, collision_or_goal, lost_or_captured
 from sim_core.packed import packed
-from sim_core.state import WorldState
+from sim_core.state import WorldState, own_group
 
 ELLIPSE_COLUMNS = 7
 """a, b, x_c, y_c, theta, x_g, y_g."""
@@ -45,7 +48,7 @@ STEP_REWARD_SHARE = 100.0
 _RUNNING, _GOAL, _TIMEOUT = int(Outcome.RUNNING), int(Outcome.GOAL), int(Outcome.TIMEOUT)
 
 
-class EnclosedParams(NamedTuple):
+class EllipseMethodParams(NamedTuple):
     """Constants of the ellipse methods."""
 
     ellipse: EllipseParams
@@ -57,28 +60,20 @@ class EnclosedParams(NamedTuple):
     limit: float
     columns: int
     field_of_all: bool
-    outer_m: Any
-    outer_sq: Any
-    collision_sq: Any
-    must_surround: bool
-    outside_limit_steps: int
-    horizon_steps: int
-    timeout_fails: bool
-    reward_scale: float
-    rewards_progress: bool
+    episode: EpisodeParams
 
 
 @kernel
-def _order_groups(learner, pos_x, pos_y, order, distance_sq, p):
+def _order_groups(world, state, order, distance_sq, p):
     """Fills `order` `[groups]`: the own group, then the others as the settings say; `distance_sq` is scratch."""
-    robots = p.ellipse.robots
-    own = learner // robots
+    pos_x, pos_y, learner = state.pos_x[world], state.pos_y[world], state.learner[world]
+    own = state.group[learner]
     order[0] = own
     for place in range(1, p.groups):
         group = (own + place) % p.groups
         at = place
         if p.nearest_first:
-            x, y, _ = group_centre(group, robots, pos_x, pos_y, NOBODY)
+            x, y, _ = group_centre(state.group_begin[group], state.group_begin[group + 1], pos_x, pos_y, NOBODY)
             dx, dy = x - pos_x[learner], y - pos_y[learner]
             near = dx * dx + dy * dy
             while at > 1 and distance_sq[at - 1] > near:
@@ -89,19 +84,20 @@ def _order_groups(learner, pos_x, pos_y, order, distance_sq, p):
 
 
 @kernel
-def _write_row(group, learner, pos_x, pos_y, goal_x, goal_y, out, at, p):
+def _write_row(group, world, state, out, at, p):
     """Writes one group's row to `out[at:at + columns]`."""
-    robots = p.ellipse.robots
-    a, b, x_c, y_c, theta = group_ellipse(group, pos_x, pos_y, left_out_of(learner, p.ellipse), p.ellipse)
+    pos_x, pos_y, learner = state.pos_x[world], state.pos_y[world], state.learner[world]
+    begin, end = state.group_begin[group], state.group_begin[group + 1]
+    a, b, x_c, y_c, theta = group_ellipse(begin, end, pos_x, pos_y, left_out_of(learner, p.ellipse), p.ellipse)
     out[at], out[at + 1] = a * p.ellipse_scale, b * p.ellipse_scale
     out[at + 2] = (x_c - pos_x[learner]) * p.ellipse_scale
     out[at + 3] = (y_c - pos_y[learner]) * p.ellipse_scale
     out[at + 4] = theta
-    out[at + 5] = (goal_x[group] - pos_x[learner]) * p.goal_scale
-    out[at + 6] = (goal_y[group] - pos_y[learner]) * p.goal_scale
+    out[at + 5] = (state.goal_x[world, group] - pos_x[learner]) * p.goal_scale
+    out[at + 6] = (state.goal_y[world, group] - pos_y[learner]) * p.goal_scale
     if p.columns > ELLIPSE_COLUMNS:
-        begin = 0 if p.field_of_all else group * robots
-        end = p.groups * robots if p.field_of_all else begin + robots
+        if p.field_of_all:
+            begin, end = 0, pos_x.shape[0]
         out[at + 7], out[at + 8] = field_of(learner, begin, end, pos_x, pos_y, p.field)
     for i in range(at, at + p.columns):
         out[i] = min(max(out[i], -p.limit), p.limit)
@@ -113,41 +109,39 @@ def _perceive(state, mask, out, order, distance_sq, params):
     for world in range(mask.shape[0]):
         if not mask[world]:
             continue
-        pos_x, pos_y, learner = state.pos_x[world], state.pos_y[world], state.learner[world]
-        _order_groups(learner, pos_x, pos_y, order, distance_sq, p)
+        _order_groups(world, state, order, distance_sq, p)
         for row in range(p.groups):
-            goal_x, goal_y = state.goal_x[world], state.goal_y[world]
-            _write_row(order[row], learner, pos_x, pos_y, goal_x, goal_y, out[world], row * p.columns, p)
+            _write_row(order[row], world, state, out[world], row * p.columns, p)
 
 
 @kernel
 def _outcome(state, out, params):
-    p = params[0]
+    p, e = params[0], params[0].episode
     for world in range(out.shape[0]):
         pos_x, pos_y, learner = state.pos_x[world], state.pos_y[world], state.learner[world]
-        goal_x, goal_y = state.goal_x[world], state.goal_y[world]
-        inside = in_own_ellipse(learner, pos_x, pos_y, p.ellipse)
+        group, begin, end = own_group(state, world)
+        inside = in_own_ellipse(learner, begin, end, pos_x, pos_y, p.ellipse)
         state.outside_steps[world] = 0 if inside else state.outside_steps[world] + 1
-        robots = p.ellipse.robots
-        ended = collision_or_goal(learner, robots, pos_x, pos_y, goal_x, goal_y, p.collision_sq, p.outer_m)
-        if ended == _RUNNING and state.outside_steps[world] >= p.outside_limit_steps:
-            ended = lost_or_captured(learner, robots, pos_x, pos_y, p.outer_sq, p.must_surround)
-        if ended == _RUNNING and state.steps[world] >= p.horizon_steps:
+        goal_x, goal_y = state.goal_x[world, group], state.goal_y[world, group]
+        ended = collision_or_goal(learner, begin, end, pos_x, pos_y, goal_x, goal_y, e.collision_sq, e.outer_m)
+        if ended == _RUNNING and state.outside_steps[world] >= e.outside_limit_steps:
+            ended = lost_or_captured(learner, begin, end, pos_x, pos_y, e.outer_sq, e.must_surround)
+        if ended == _RUNNING and state.steps[world] >= e.horizon_steps:
             ended = _TIMEOUT
         out[world] = ended
 
 
 @kernel
 def _reward(state, outcome, out, params):
-    p = params[0]
+    e = params[0].episode
     for world in range(out.shape[0]):
-        closer = came_closer(state, world, p.ellipse.robots) if p.rewards_progress else True
-        if outcome[world] == _RUNNING or (outcome[world] == _TIMEOUT and not p.timeout_fails):
-            share = p.reward_scale / STEP_REWARD_SHARE
+        closer = came_closer(state, world) if e.rewards_progress else True
+        if outcome[world] == _RUNNING or (outcome[world] == _TIMEOUT and not e.timeout_fails):
+            share = e.reward_scale / STEP_REWARD_SHARE
             good = state.outside_steps[world] == 0 and closer
             reward = share if good else -share
         else:
-            reward = p.reward_scale if outcome[world] == _GOAL else -p.reward_scale
+            reward = e.reward_scale if outcome[world] == _GOAL else -e.reward_scale
         out[world] = reward
         state.episode_return[world] += reward
 
@@ -155,7 +149,7 @@ def _reward(state, outcome, out, params):
 def observation_limit(config: WorldConfig) -> float:
     """A bound of every observation: no robot gets farther from the arena's centre than its speed takes it."""
     travel_m = config.horizon_steps * config.time_step_s * config.top_speed_m_s
-    reach_m = config.arena_radius_m + start_grid_radius_m(config) + travel_m
+    reach_m = config.scene_class.reach_m(config) + travel_m
     offset = 2 * reach_m * max(config.ellipse_scale_per_m, config.goal_scale_per_m)
     spread_m = math.sqrt(2) * reach_m  # the variance of n points is at most n / (n - 1) times the reach squared
     half_axis_m = max(math.sqrt(config.ellipse_chi_square) * spread_m, config.ellipse_smallest_half_axis_m)
@@ -164,24 +158,38 @@ def observation_limit(config: WorldConfig) -> float:
     )
 
 
-class EnclosedMethod(Method):
+COLUMN_NAMES = ("a", "b", "x_c", "y_c", "theta", "x_g", "y_g", "u_apf_x", "u_apf_y")
+"""Elements of a group's row; `a` and `b` are the smaller and the larger half-axis."""
+ELLIPSE_WORLD: dict[str, Any] = {**SWARM_WORLD, "ellipse_counts_learner": True, "learner_speed_limit_m_s": 1.5}
+"""The world of the presets (see `learner.presets`)."""
+ELLIPSE_PRESETS = {
+    "thesis": Preset({"n_step": 1, "samples_per_insert": 4.0}, ELLIPSE_WORLD),
+    "best": Preset({"n_step": 3, "samples_per_insert": 4.0}, {**ELLIPSE_WORLD, "ellipse_reward": "progress"}),
+}
+
+
+class EllipseMethod(Method):
     """State matrix, outcome and reward of the ellipse methods.
 
     Args:
       config: the setup.
-      columns: elements of a group's row.
     """
+
+    timeout_fails = True
+    draws = frozenset({"ellipses"})
+    presets = ELLIPSE_PRESETS
+    columns: ClassVar[int] = ELLIPSE_COLUMNS
+    """Elements of a group's row."""
 
     observation_dtype = np.float32
 
-    def __init__(self, config: WorldConfig, columns: int = ELLIPSE_COLUMNS) -> None:
-        self.observation_shape = (config.groups * columns,)
+    def __init__(self, config: WorldConfig) -> None:
+        super().__init__(config)
         self.observation_limit = observation_limit(config)
         self._order = np.zeros(config.groups, np.int32)
         self._distance_sq = np.zeros(config.groups, np.float64)
-        real = np.float32
         self._params = packed(
-            EnclosedParams(
+            EllipseMethodParams(
                 ellipse=ellipse_params(config),
                 field=field_params(config),
                 groups=config.groups,
@@ -189,19 +197,38 @@ class EnclosedMethod(Method):
                 ellipse_scale=float(config.ellipse_scale_per_m),
                 goal_scale=float(config.goal_scale_per_m),
                 limit=self.observation_limit,
-                columns=columns,
+                columns=self.columns,
                 field_of_all=config.apf_rows == "all",
-                outer_m=real(config.outer_radius_m),
-                outer_sq=real(config.outer_radius_m) ** 2,
-                collision_sq=real(2 * config.robot_radius_m) ** 2,
-                must_surround=config.captured_is == "surrounded",
-                outside_limit_steps=config.outside_limit_steps,
-                horizon_steps=config.horizon_steps,
-                timeout_fails=config.timeout_fails,
-                reward_scale=float(config.reward_scale),
-                rewards_progress=config.ellipse_reward == "progress",
+                episode=episode_params(config),
             )
         )
+
+    @classmethod
+    def observation_names(cls, config: WorldConfig) -> tuple[str, ...]:
+        """A row a group, the own one first."""
+        rows = ("own group", *(f"other group {row}" for row in range(1, config.groups)))
+        return tuple(f"{row}, {name}" for row in rows for name in COLUMN_NAMES[: cls.columns])
+
+    @classmethod
+    def check(cls, config: WorldConfig) -> None:
+        """Raises ConfigError where an ellipse has too few robots, or sectors are not in the world's frame."""
+        super().check(config)
+        require(
+            config.ellipse_counts_learner or min(config.group_sizes) >= 3,
+            f"robots must be at least 3 per group for method {config.method_name!r}, not {min(config.group_sizes)}: an "
+            "ellipse without the learning robot (ellipse_counts_learner) needs two others",
+        )
+
+    @classmethod
+    def greedy(cls, config: WorldConfig) -> GreedyRule:
+        """The heading nearest to the direction of the own group's centre; the lowest index among equals."""
+        headings = heading_velocities(config, np.float64)[: config.sectors]
+
+        def act(observation: NDArray[Any]) -> NDArray[np.int64]:
+            centre = observation[:, 2:4].astype(np.float64)
+            return np.asarray(np.argmax(centre @ headings.T, axis=1), np.int64)
+
+        return act
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.float32]) -> None:
         """4.2.1: the state matrix `[num_worlds, groups * columns]`, row after row."""

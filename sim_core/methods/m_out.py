@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_core.checks import require
 from sim_core.config import WorldConfig
 from sim_core.jit import kernel
 from sim_core.methods.apf import field_of, field_params, limited
-from sim_core.methods.group_ellipses import EnclosedMethod
-from sim_core.methods.headings import heading_velocities, write_headings
+from sim_core.methods.group_ellipses import EllipseMethod
 from sim_core.packed import packed
 from sim_core.state import WorldState
 
@@ -29,15 +29,31 @@ def _add_field(state, out_x, out_y, speed_limit_m_s, params):
         out_x[world], out_y[world] = limited(out_x[world] + x, out_y[world] + y, speed_limit_m_s)
 
 
-class OutsideMethod(EnclosedMethod):
+class OutsideMethod(EllipseMethod):
     """M_OUT: m x 7 values (a, b, x_c, y_c, theta, x_g, y_g), velocity u_nn + u_apf."""
 
+    label = "M_OUT"
+    robot_module = "learner.export.ellipse_methods:OutsideRobot"
+
     def __init__(self, config: WorldConfig) -> None:
-        """Takes its constants from `config`."""
         super().__init__(config)
-        self._velocities = heading_velocities(config, np.float32)
         self._field = packed(field_params(config))
         self._speed_limit_m_s = float(config.learner_speed_limit_m_s)
+
+    @classmethod
+    def check(cls, config: WorldConfig) -> None:
+        """Raises ConfigError where M_IN's would, or where the sum may be slower than u_nn alone."""
+        super().check(config)
+        require(
+            config.learner_speed_limit_m_s >= config.learner_speed_m_s,
+            f"learner_speed_limit_m_s ({config.learner_speed_limit_m_s}) must be at least learner_speed_m_s "
+            f"({config.learner_speed_m_s}), the speed of u_nn alone",
+        )
+
+    @classmethod
+    def top_speed_m_s(cls, config: WorldConfig) -> float:
+        """The limit of the sum u_nn + u_apf."""
+        return config.learner_speed_limit_m_s
 
     def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
         """u_l = u_nn + u_apf (4.2.2), with u_nn of Eq. 3.4.
@@ -45,5 +61,5 @@ class OutsideMethod(EnclosedMethod):
         Raises:
           ValueError: there is not one action a world, or one is none of the actions.
         """
-        write_headings(self._velocities, action, out_x, out_y)
+        super().velocity(state, action, out_x, out_y)
         _add_field(state, out_x, out_y, self._speed_limit_m_s, self._field)

@@ -17,35 +17,25 @@ from numpy.typing import NDArray
 
 from sim_core.config import WorldConfig
 from sim_core.jit import kernel
-from sim_core.methods.base import Method
-from sim_core.methods.headings import heading_velocities, write_headings
-from sim_core.methods.progress import came_closer, goal_offset
-from sim_core.outcomes import Outcome, end_of_step
+from sim_core.methods.base import GreedyRule, Method, Preset
+from sim_core.methods.progress import goal_offset
 from sim_core.packed import packed
-from sim_core.state import WorldState
+from sim_core.state import WorldState, own_group
 
 COUNT_LIMIT = 127
 """Counts saturate here, so that they fit int8."""
-
-_RUNNING, _GOAL, _TIMEOUT = int(Outcome.RUNNING), int(Outcome.GOAL), int(Outcome.TIMEOUT)
+WORLD: dict[str, Any] = {"max_neighbours": 16, "orca_radius_m": 0.18, "robot_radius_m": 0.06}
+"""The world of the presets (see `learner.presets`)."""
 
 
 class SensorParams(NamedTuple):
     """Constants of M_sensor."""
 
-    robots: int
     sectors: int
     separate: bool
     faces_goal: bool
     inner_sq: Any
     outer_sq: Any
-    outer_m: Any
-    collision_sq: Any
-    must_surround: bool
-    horizon_steps: int
-    reward_scale: float
-    clock_is_step: bool
-    timeout_fails: bool
 
 
 def sector_edges(sectors: int) -> NDArray[np.float64]:
@@ -67,9 +57,9 @@ def sector_of(dx, dy, edges):
 
 
 @kernel
-def _goal_direction(state, world, robots):
+def _goal_direction(state, world):
     """Unit vector from the learning robot to its goal; +x where it stands on it."""
-    dx, dy = goal_offset(state, world, robots)
+    dx, dy = goal_offset(state, world)
     length = np.sqrt(dx * dx + dy * dy)
     if length == 0.0:
         return np.cos(dx), dy  # (1, 0) of the positions' dtype
@@ -77,9 +67,9 @@ def _goal_direction(state, world, robots):
 
 
 @kernel
-def _turn_to_goal(state, out_x, out_y, params):
+def _turn_to_goal(state, out_x, out_y):
     for world in range(out_x.shape[0]):
-        cos, sin = _goal_direction(state, world, params[0].robots)
+        cos, sin = _goal_direction(state, world)
         x, y = out_x[world], out_y[world]
         out_x[world], out_y[world] = cos * x - sin * y, sin * x + cos * y
 
@@ -92,9 +82,8 @@ def _perceive(state, mask, out, edges, params):
             continue
         pos_x, pos_y = state.pos_x[world], state.pos_y[world]
         learner = state.learner[world]
-        group_begin = learner // p.robots * p.robots
-        group_end = group_begin + p.robots
-        cos, sin = _goal_direction(state, world, p.robots)
+        _, group_begin, group_end = own_group(state, world)
+        cos, sin = _goal_direction(state, world)
         out[world, :] = 0
         for other in range(pos_x.shape[0]):
             dx, dy = pos_x[other] - pos_x[learner], pos_y[other] - pos_y[learner]
@@ -110,71 +99,70 @@ def _perceive(state, mask, out, edges, params):
             out[world, cell] = min(max(out[world, cell] + step, -COUNT_LIMIT), COUNT_LIMIT)
 
 
-@kernel
-def _outcome(state, out, params):
-    p = params[0]
-    for world in range(out.shape[0]):
-        ended = end_of_step(
-            state.learner[world],
-            p.robots,
-            state.pos_x[world],
-            state.pos_y[world],
-            state.goal_x[world],
-            state.goal_y[world],
-            p.collision_sq,
-            p.outer_m,
-            p.must_surround,
-        )
-        if ended == _RUNNING and state.steps[world] >= p.horizon_steps:
-            ended = _TIMEOUT
-        out[world] = ended
-
-
-@kernel
-def _reward(state, outcome, out, params):
-    p = params[0]
-    for world in range(out.shape[0]):
-        closer = came_closer(state, world, p.robots)
-        if outcome[world] == _RUNNING or (outcome[world] == _TIMEOUT and not p.timeout_fails):
-            clock = state.steps[world] if p.clock_is_step else p.horizon_steps
-            reward = p.reward_scale / clock if closer else -p.reward_scale / clock
-        else:
-            reward = p.reward_scale if outcome[world] == _GOAL else -p.reward_scale
-        out[world] = reward
-        state.episode_return[world] += reward
-
-
 class SensorMethod(Method):
     """M_sensor: counts by sectors, velocity u_nn, Table 3.1's reward, lost or collision as failures."""
+
+    label = "M_sensor"
+    swarm_knows_learner = True
+    fits_any_groups = True
+    draws = frozenset({"sectors"})
+    presets = {
+        "thesis": Preset({"n_step": 1, "samples_per_insert": 1.5}, WORLD),
+        "best": Preset({"n_step": 3, "samples_per_insert": 3.0}, {**WORLD, "sensor_counts": "separate"}),
+    }
+    robot_module = "learner.export.m_sensor:SensorRobot"
 
     observation_dtype = np.int8
     observation_limit = COUNT_LIMIT
 
     def __init__(self, config: WorldConfig) -> None:
-        """Takes its constants from `config`."""
-        separate = config.sensor_counts == "separate"
-        self.observation_shape = ((4 if separate else 2) * config.sectors,)
+        super().__init__(config)
         self._faces_goal = config.sector_frame == "goal"
-        self._velocities = heading_velocities(config, np.float32)
         self._edges = sector_edges(config.sectors)
         real = np.float32
         self._params = packed(
             SensorParams(
-                robots=config.robots,
                 sectors=config.sectors,
-                separate=separate,
+                separate=config.sensor_counts == "separate",
                 faces_goal=self._faces_goal,
                 inner_sq=real(config.inner_radius_m) ** 2,
                 outer_sq=real(config.outer_radius_m) ** 2,
-                outer_m=real(config.outer_radius_m),
-                collision_sq=real(2 * config.robot_radius_m) ** 2,
-                must_surround=config.captured_is == "surrounded",
-                horizon_steps=config.horizon_steps,
-                reward_scale=float(config.reward_scale),
-                clock_is_step=config.reward_clock == "step",
-                timeout_fails=config.timeout_fails,
             )
         )
+
+    @classmethod
+    def observation_names(cls, config: WorldConfig) -> tuple[str, ...]:
+        """A count per region and sector; of the own group, then of others, where they are separate."""
+        kinds = ("own", "others") if config.sensor_counts == "separate" else ("own less others",)
+        regions = ("disc", "ring")
+        return tuple(
+            f"{kind}, {region}, sector {sector}"
+            for kind in kinds
+            for region in regions
+            for sector in range(config.sectors)
+        )
+
+    @classmethod
+    def check(cls, config: WorldConfig) -> None:
+        """Every setting works: sectors may be in the world's frame or the goal's."""
+
+    @classmethod
+    def greedy(cls, config: WorldConfig) -> GreedyRule:
+        """Heads into the sector with the most own robots less other robots, over both sensing regions.
+
+        Among equal sectors, the one with the most in the outer ring: its robots are those that are about to be lost.
+        Among these, the lowest index, as a learned policy does.
+        """
+        cells, separate = 2 * config.sectors, config.sensor_counts == "separate"
+
+        def act(observation: NDArray[Any]) -> NDArray[np.int64]:
+            counts = observation.astype(np.int64)
+            own, others = counts[:, :cells], counts[:, cells:]
+            inner, ring = np.split(own - others if separate else own, 2, axis=1)
+            size = 2 * np.abs(ring).max(initial=0) + 1  # more than two rings can differ by
+            return np.asarray(np.argmax(size * (inner + ring) + ring, axis=1), np.int64)
+
+        return act
 
     def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
         """Eq. 3.4: constant speed towards the chosen sector's centre, in the frame of the sectors.
@@ -182,18 +170,10 @@ class SensorMethod(Method):
         Raises:
           ValueError: there is not one action a world, or one is none of the actions.
         """
-        write_headings(self._velocities, action, out_x, out_y)
+        super().velocity(state, action, out_x, out_y)
         if self._faces_goal:
-            _turn_to_goal(state, out_x, out_y, self._params)
+            _turn_to_goal(state, out_x, out_y)
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
         """3.2.1: `[num_worlds, 2q]` counts, the inner disc's q first; apart, 2q of the own group, then 2q of others."""
         _perceive(state, mask, out, self._edges, self._params)
-
-    def outcome(self, state: WorldState, out: NDArray[np.int8]) -> None:
-        """3.2.1: goal, collision, lost or captured; timeout at the horizon."""
-        _outcome(state, out, self._params)
-
-    def reward(self, state: WorldState, outcome: NDArray[np.int8], out: NDArray[np.float32]) -> None:
-        """Table 3.1, with the robot's own distance to the goal as "closer"; a timeout that is no failure is a step."""
-        _reward(state, outcome, out, self._params)

@@ -26,7 +26,6 @@ from sim_core.swarm.flock_rules import (
 from sim_core.swarm.flocking import clear_leaders, finish_separation, look, mark_followers, preferred_velocity
 from sim_core.swarm.grid import CELLS_PER_RANGE, arrange
 from sim_core.swarm.neighbours import NeighbourParams, find_neighbours, lists_of, neighbour_params
-from sim_core.swarm.scenario import start_world
 from sim_core.swarm.tile import GRID_FROM_ROBOTS, worlds_per_tile
 
 
@@ -40,7 +39,7 @@ class SwarmParams(NamedTuple):
     nowhere: Any
     cell_edge_m: float
     knows_learner: bool
-    robots: int
+    num_robots: int
     groups: int
     tile_worlds: int
 
@@ -59,7 +58,7 @@ def swarm_params(config: WorldConfig, dtype: Any) -> SwarmParams:
         nowhere=real(np.nan),
         cell_edge_m=config.neighbour_range_m / CELLS_PER_RANGE,
         knows_learner=config.learner_is_known,
-        robots=config.robots,
+        num_robots=config.num_robots,
         groups=config.groups,
         tile_worlds=worlds_per_tile(config.num_robots),
     )
@@ -70,7 +69,7 @@ def _load_world(world, base, state, tile, p):
     """Copies one world's old state into the tile, from slot `base` on."""
     for group in range(p.groups):
         goal_x, goal_y = state.goal_x[world, group], state.goal_y[world, group]
-        for i in range(group * p.robots, (group + 1) * p.robots):
+        for i in range(state.group_begin[group], state.group_begin[group + 1]):
             slot = base + i
             x, y = state.pos_x[world, i], state.pos_y[world, i]
             to_x, to_y = goal_x - x, goal_y - y
@@ -85,7 +84,7 @@ def _load_world(world, base, state, tile, p):
 @inlined
 def load_tile(first, worlds, state, tile, p):
     """Copies the old state of `worlds` worlds into the tile and arranges the candidates; returns the rows."""
-    size = p.robots * p.groups
+    size = p.num_robots
     for i in range(worlds):
         _load_world(first + i, i * size, state, tile, p)
     if p.near.grid:
@@ -106,7 +105,7 @@ def _separation_gain(row, tile_index, apart, tile, rng, p):
     """Gain of the published separation (a vector): 1 and a random part, one draw a robot."""
     if not (p.flock.rules == PUBLISHED and p.flock.separation_noise > p.flock.zero and any_lane(apart > p.flock.zero)):
         return splat(p.flock.one)
-    size = p.robots * p.groups
+    size = p.num_robots
     for lane in range(LANES):
         slot = tile.order[row, lane]
         world = min(tile_index * p.tile_worlds + slot // size, rng.shape[0] - 1)
@@ -130,7 +129,7 @@ def find_flock_terms(tile_index, rows, tile, rng, p):
 @inlined
 def tile_velocities(tile_index, num_slots, rows, tile, rng, p):
     """FL-ORCA's new velocities of all robots of a tile, into `tile.new_vx`, `tile.new_vy`."""
-    size = p.robots * p.groups
+    size = p.num_robots
     for row in range(rows):
         find_neighbours(row, tile_index, size, num_slots, tile, p.near)
     if p.flock.rules != NO_FLOCK:
@@ -183,28 +182,16 @@ def advance(state, tile, command_x, command_y, piloted, params):
 
 
 @kernel
-def restart(state, mask, s):
-    """Starts a new episode in every world where `mask` `[num_worlds]` bool is set; `s`: ScenarioParams."""
+def reset_episode(state, mask):
+    """Resets the counters of an episode that a scene has just placed, where `mask` `[num_worlds]` bool is set."""
     for world in range(mask.shape[0]):
         if not mask[world]:
             continue
-        start_world(
-            world,
-            state.pos_x,
-            state.pos_y,
-            state.vel_x,
-            state.vel_y,
-            state.goal_x,
-            state.goal_y,
-            state.learner,
-            state.rng,
-            s,
-        )
         state.steps[world] = 0
         state.outside_steps[world] = 0
         state.episode_return[world] = 0.0
         learner = state.learner[world]
-        group = learner // s.robots
+        group = state.group[learner]
         dx = state.pos_x[world, learner] - state.goal_x[world, group]
         dy = state.pos_y[world, learner] - state.goal_y[world, group]
         state.goal_distance_m[world] = np.sqrt(dx * dx + dy * dy)

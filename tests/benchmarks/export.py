@@ -15,9 +15,8 @@ from rich.table import Table
 from actors.policy.baselines import Baseline
 from actors.policy.network import QNetwork, snapshot
 from learner.config import RunConfig
-from learner.export.ports import robot_inputs, robot_outputs
 from learner.export.reference_states import Sensed, swarm_states
-from learner.export.robot_policy import make_robot
+from learner.export.robot_module import make_robot
 from learner.export.write import ONNX, PROGRAM, Agreement, onnx_session, write_export
 from learner.presets import preset_config
 from sim_core.methods import make_method
@@ -76,7 +75,7 @@ def measure(method: str, robots: int, groups: int) -> tuple[dict[str, Agreement]
     robot = make_robot(network, world).eval()
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "export"
-        found = write_export(out, robot, robot_inputs(world), robot_outputs(world), {}, states)
+        found = write_export(out, robot, robot.inputs(world), robot.outputs(world), {}, states)
         speeds = timed_rates(deciders(out, robot, states), ROUNDS)
     return found, speeds, len(set(states.expected["action"]))
 

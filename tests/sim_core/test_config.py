@@ -7,7 +7,8 @@ import math
 import pytest
 
 from sim_core.checks import ConfigError
-from sim_core.config import ANGLES, MAX_HEADINGS, NON_NEGATIVE, POSITIVE, WorldConfig, start_grid_radius_m
+from sim_core.config import ANGLES, MAX_HEADINGS, NON_NEGATIVE, POSITIVE, WorldConfig
+from sim_core.scenes.circle import start_grid_radius_m
 
 DEFAULTS = {field.name: field.default for field in dataclasses.fields(WorldConfig)}
 WHOLE = [name for name, value in DEFAULTS.items() if type(value) is int]

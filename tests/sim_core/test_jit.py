@@ -23,12 +23,13 @@ import numba
 before = numba.config.CACHE_DIR
 import numpy as np
 from sim_core.config import WorldConfig
-from sim_core.swarm.scenario import scenario_params, start_world
+from sim_core.scenes.circle import circle_params, start_world
+from sim_core.state import empty_state
 
-pos, vel, goals = np.zeros((2, 1, 20)), np.zeros((2, 1, 20)), np.zeros((2, 1, 2))
-learner, stream = np.zeros(1, np.int32), np.ones(1, np.uint64)
-start_world(0, *pos, *vel, *goals, learner, stream, scenario_params(WorldConfig()))
-print(pos.sum(), numba.config.CACHE_DIR == before)
+state = empty_state(WorldConfig(), 1, np.float64)
+state.rng[0] = 1
+start_world(0, state, circle_params(WorldConfig()))
+print(state.pos_x.sum() + state.pos_y.sum(), numba.config.CACHE_DIR == before)
 """
 
 
@@ -63,7 +64,7 @@ def test_kernels_follow_changes_of_any_source(tmp_path):
     compiled = kept(tmp_path)
     assert compiled and start(tmp_path) == first and kept(tmp_path) == compiled  # nothing compiled anew
     change(tmp_path / "sim_core" / "rng.py", r"(?<=_MIX_1 = np.uint64\()0xBF58476D1CE4E5B9", "0xBF58476D1CE4E5BB")
-    second = start(tmp_path)  # the kernel is in scenario.py, which is as it was
+    second = start(tmp_path)  # the kernel is in circle.py, which is as it was
     assert second[0] != first[0]
     assert first[1] and second[1]
     both = kept(tmp_path)

@@ -26,9 +26,10 @@ ROBOT, MATE, OTHER_A, OTHER_B = range(4)
 def outcome(pos, goal=(FAR, FAR), robot=ROBOT, must_surround=False):
     """Outcome of two groups of two (robots 0, 1 and 2, 3)."""
     pos_x, pos_y = np.ascontiguousarray(np.asarray(pos, REAL).T)
-    goal_x, goal_y = np.array([goal[0], -FAR], REAL), np.array([goal[1], -FAR], REAL)
-    contact_sq = REAL(CONTACT_M) ** 2
-    return Outcome(end_of_step(robot, 2, pos_x, pos_y, goal_x, goal_y, contact_sq, REAL(RANGE_M), must_surround))
+    begin = robot // 2 * 2
+    x, y = (REAL(goal[0]), REAL(goal[1])) if begin == 0 else (REAL(-FAR), REAL(-FAR))
+    ended = end_of_step(robot, begin, begin + 2, pos_x, pos_y, x, y, REAL(CONTACT_M) ** 2, REAL(RANGE_M), must_surround)
+    return Outcome(ended)
 
 
 ALONE = [(0, 0), (9, 0), (0, 9), (0, -9)]
@@ -100,8 +101,8 @@ def test_mean_goal_distance_matches_numpy():
         for g in range(groups):
             own = pos[g * robots : (g + 1) * robots].astype(np.float64)
             expected = np.linalg.norm(own - goal[g], axis=1).mean()
-            args = (*np.ascontiguousarray(pos.T), *np.ascontiguousarray(goal.T))
-            assert group_goal_distance_m(g, robots, *args) == pytest.approx(expected, rel=1e-6)
+            args = (*np.ascontiguousarray(pos.T), *goal[g])
+            assert group_goal_distance_m(g * robots, (g + 1) * robots, *args) == pytest.approx(expected, rel=1e-6)
 
 
 def test_sensing_and_contact_match_numpy():
@@ -114,7 +115,10 @@ def test_sensing_and_contact_match_numpy():
         near = (dist_sq < REAL(1)) & (np.arange(30) != robot)
         own = np.arange(30) // 10 == robot // 10
         pos_x, pos_y = np.ascontiguousarray(pos.T)
-        assert sensed(robot, 10, pos_x, pos_y, REAL(1)) == ((near & own).sum(), (near & ~own).sum())
+        assert sensed(robot, robot // 10 * 10, robot // 10 * 10 + 10, pos_x, pos_y, REAL(1)) == (
+            (near & own).sum(),
+            (near & ~own).sum(),
+        )
         nearest_sq = np.delete(dist_sq, robot).min()
         assert not collides(robot, pos_x, pos_y, nearest_sq)
         assert collides(robot, pos_x, pos_y, np.nextafter(nearest_sq, REAL(9)))
@@ -123,7 +127,7 @@ def test_sensing_and_contact_match_numpy():
 def test_lost_or_captured():
     for pos, expected in ((ALONE, "LOST"), (TOGETHER, "LOST"), (MIXED, "LOST"), (AMONG, "CAPTURED")):
         pos_x, pos_y = np.ascontiguousarray(np.asarray(pos, REAL).T)
-        assert lost_or_captured(ROBOT, 2, pos_x, pos_y, REAL(RANGE_M) ** 2, False) == Outcome[expected]
+        assert lost_or_captured(ROBOT, 0, 2, pos_x, pos_y, REAL(RANGE_M) ** 2, False) == Outcome[expected]
 
 
 THREE_AROUND = [(1.0, -0.5), (-1.0, -0.5), (0, 1.0)]
@@ -148,16 +152,15 @@ def learner_and(others):
 )
 def test_captured_may_have_to_be_surrounded(others, expected):
     pos_x, pos_y = learner_and(others)
-    assert lost_or_captured(0, 3, pos_x, pos_y, REAL(RANGE_M) ** 2, True) == Outcome[expected]
-    goal = np.array([FAR, -FAR], REAL)
-    ended = end_of_step(0, 3, pos_x, pos_y, goal, goal, REAL(CONTACT_M) ** 2, REAL(RANGE_M), True)
+    assert lost_or_captured(0, 0, 3, pos_x, pos_y, REAL(RANGE_M) ** 2, True) == Outcome[expected]
+    ended = end_of_step(0, 0, 3, pos_x, pos_y, REAL(FAR), REAL(FAR), REAL(CONTACT_M) ** 2, REAL(RANGE_M), True)
     assert ended == Outcome[expected]
 
 
 def test_who_senses_an_own_robot_is_not_captured_among_others_all_around():
     pos_x, pos_y = learner_and(THREE_AROUND)
     pos_x[1] = 1.2
-    assert lost_or_captured(0, 3, pos_x, pos_y, REAL(RANGE_M) ** 2, True) == Outcome.LOST
+    assert lost_or_captured(0, 0, 3, pos_x, pos_y, REAL(RANGE_M) ** 2, True) == Outcome.LOST
 
 
 def inside_hull(point, corners):
@@ -180,10 +183,9 @@ def test_surrounded_is_inside_the_convex_hull():
 
 
 def test_collision_or_goal_knows_nothing_of_lost():
-    goal_x, goal_y = np.array([0, FAR], REAL), np.array([0, FAR], REAL)
     for mate, expected in ((2.9, "GOAL"), (3.1, "RUNNING"), (0.1, "COLLISION")):
         pos_x, pos_y = np.array([0, mate, 9, -9], REAL), np.array([0, 0, 9, -9], REAL)
-        found = collision_or_goal(ROBOT, 2, pos_x, pos_y, goal_x, goal_y, REAL(CONTACT_M) ** 2, REAL(RANGE_M))
+        found = collision_or_goal(ROBOT, 0, 2, pos_x, pos_y, REAL(0), REAL(0), REAL(CONTACT_M) ** 2, REAL(RANGE_M))
         assert found == Outcome[expected]
 
 

@@ -6,14 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
-from actors.policy.baselines import (
-    Baseline,
-    FlOrcaPlayer,
-    GreedyEllipsePlayer,
-    GreedySensorPlayer,
-    RandomPlayer,
-    make_baseline,
-)
+from actors.policy.baselines import Baseline, FlOrcaRule, GreedyMethodRule, RandomRule, make_baseline
 from sim_core.config import WorldConfig
 from sim_core.worlds import WorldBatch
 
@@ -40,21 +33,21 @@ def counts(inner, ring):
     ],
 )
 def test_greedy_on_counts(inner, ring, sector):
-    assert GreedySensorPlayer(Q4).act(counts(inner, ring)).tolist() == [sector]
+    assert GreedyMethodRule(Q4).act(counts(inner, ring)).tolist() == [sector]
 
 
 def test_greedy_on_counts_apart_is_greedy_on_their_difference():
     rng = np.random.default_rng(0)
     own, others = rng.integers(0, 6, (2, 200, 16)).astype(np.int8)
-    apart = GreedySensorPlayer(WorldConfig(sensor_counts="separate")).act(np.concatenate([own, others], axis=1))
-    assert apart.tolist() == GreedySensorPlayer(WorldConfig()).act(own - others).tolist()
+    apart = GreedyMethodRule(WorldConfig(sensor_counts="separate")).act(np.concatenate([own, others], axis=1))
+    assert apart.tolist() == GreedyMethodRule(WorldConfig()).act(own - others).tolist()
 
 
 def test_greedy_judges_each_episode_alone():
     rng = np.random.default_rng(0)
     observation = rng.integers(-5, 6, (200, 16)).astype(np.int8)
-    player = GreedySensorPlayer(WorldConfig())
-    batched = player.act(observation)
+    rule = GreedyMethodRule(WorldConfig())
+    batched = rule.act(observation)
     assert batched.dtype == np.int64
     expected = [
         max(range(8), key=lambda sector, row=row: (row[sector] + row[8 + sector], row[8 + sector], -sector))
@@ -71,14 +64,14 @@ def test_greedy_turns_to_the_own_groups_centre(method, columns, stop_action):
     observation = rng.normal(size=(500, 3 * columns)).astype(np.float32)  # decoys in all other columns
     angle = np.arctan2(observation[:, 3], observation[:, 2])
     sector = np.floor((angle + math.pi) / (2 * math.pi / 8)).astype(int) % 8  # Eq. 3.3: the heading is its middle
-    player = make_baseline(Baseline.GREEDY, config, [0])
-    assert isinstance(player, GreedyEllipsePlayer)
-    np.testing.assert_array_equal(player.act(observation), sector)
+    rule = make_baseline(Baseline.GREEDY, config, [0])
+    assert isinstance(rule, GreedyMethodRule)
+    np.testing.assert_array_equal(rule.act(observation), sector)
 
 
 def test_greedy_at_the_centre_itself_takes_the_first_heading():
     config = WorldConfig(method="out", stop_action=True)
-    assert GreedyEllipsePlayer(config).act(np.zeros((1, 14), np.float32)).tolist() == [0]
+    assert GreedyMethodRule(config).act(np.zeros((1, 14), np.float32)).tolist() == [0]
 
 
 @pytest.mark.parametrize("method", ["sensor", "in", "out"])
@@ -86,9 +79,9 @@ def test_greedy_nears_its_group_in_a_world(method):
     worlds = WorldBatch(WorldConfig(method=method, robots=6, groups=2), 20)
     worlds.seed(list(range(20)))
     observation = worlds.reset()
-    player = make_baseline(Baseline.GREEDY, worlds.config, list(range(20)))
+    rule = make_baseline(Baseline.GREEDY, worlds.config, list(range(20)))
     for _ in range(60):
-        observation = worlds.step(player.act(observation)).observation
+        observation = worlds.step(rule.act(observation)).observation
     robot, group = worlds.state.learner, worlds.state.learner // 6
     position = worlds.positions()
     centre = position.reshape(20, 2, 6, 2).mean(axis=2)[np.arange(20), group]
@@ -97,24 +90,24 @@ def test_greedy_nears_its_group_in_a_world(method):
 
 
 def test_fl_orca_takes_no_action():
-    assert FlOrcaPlayer().act(np.zeros((3, 16))) is None
+    assert FlOrcaRule().act(np.zeros((3, 16))) is None
 
 
 def test_random_actions_depend_on_the_episodes_seed_alone():
     config = WorldConfig(horizon_steps=40)
     seeds = [5, 2_000_000_000, 2**32 - 1, 7, 6]
-    together = RandomPlayer(config, seeds)
-    alone = [RandomPlayer(config, [seed]) for seed in seeds]
+    together = RandomRule(config, seeds)
+    alone = [RandomRule(config, [seed]) for seed in seeds]
     for _ in range(config.horizon_steps):
         actions = together.act(np.zeros((5, 16)))
-        assert actions.tolist() == [int(player.act(np.ones((1, 16)))[0]) for player in alone]
+        assert actions.tolist() == [int(rule.act(np.ones((1, 16)))[0]) for rule in alone]
 
 
 @pytest.mark.parametrize("stop_action", [False, True])
 def test_random_actions_are_uniform_and_differ_between_seeds(stop_action):
     config = WorldConfig(stop_action=stop_action)
-    player = RandomPlayer(config, list(range(40)))
-    actions = np.stack([player.act(np.zeros(0)) for _ in range(config.horizon_steps)])
+    rule = RandomRule(config, list(range(40)))
+    actions = np.stack([rule.act(np.zeros(0)) for _ in range(config.horizon_steps)])
     share = np.bincount(actions.ravel(), minlength=config.num_actions) / actions.size
     assert len(share) == config.num_actions
     np.testing.assert_allclose(share, 1 / config.num_actions, atol=0.01)  # 4.5 standard errors

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from actors.evaluation.statistics import rate
-from dashboards.analysis.aggregate import GROUPS, METHOD_NAMES, ROBOTS, SETUPS, Results, Setup
+from dashboards.analysis.aggregate import GROUPS, ROBOTS, SETUPS, Results, Setup
+from dashboards.analysis.methods import DISSERTATION, STYLES, method_style
 from dashboards.figures.result_figures import (
     FIXED_STYLE,
-    METHOD_STYLES,
     PICTURES,
     TRANSFER_STYLE,
     Picture,
@@ -86,13 +86,13 @@ def test_methods_figure_has_a_chart_a_robot_count(results: Results):
     *charts, key = figure_4_4(results).axes
     assert len(charts) == 5 and key.get_legend() is not None
     for axes, robots in zip(charts, ROBOTS, strict=True):
-        assert bars(axes, METHOD_STYLES["sensor"]) == dict(enumerate(SENSOR_SUCCESS[robots]))
-        assert bars(axes, METHOD_STYLES["out"]) == dict(enumerate(OUT_SUCCESS[robots]))
-        assert bars(axes, METHOD_STYLES["in"]) == dict.fromkeys(range(5), IN_SUCCESS)
+        assert bars(axes, method_style("sensor")[:3]) == dict(enumerate(SENSOR_SUCCESS[robots]))
+        assert bars(axes, method_style("out")[:3]) == dict(enumerate(OUT_SUCCESS[robots]))
+        assert bars(axes, method_style("in")[:3]) == dict.fromkeys(range(5), IN_SUCCESS)
 
 
 def test_no_series_is_told_by_its_colour_alone():
-    assert len({hatch for _, hatch, _ in METHOD_STYLES.values()}) == 3
+    assert len({style.hatch for style in STYLES}) == len(STYLES)
     assert FIXED_STYLE[1] != TRANSFER_STYLE[1]
 
 
@@ -140,7 +140,7 @@ def test_a_line_breaks_where_a_cell_is_missing():
 
 
 def test_heatmap_holds_every_number(results: Results):
-    for axes, method in zip(heatmap(results).axes, METHOD_NAMES, strict=True):
+    for axes, method in zip(heatmap(results).axes, DISSERTATION, strict=True):
         table = {"sensor": SENSOR_SUCCESS, "out": OUT_SUCCESS}.get(method, dict.fromkeys(ROBOTS, (IN_SUCCESS,) * 5))
         written = {tuple(map(round, text.get_position())): text.get_text() for text in axes.texts[::2]}
         wanted = {(x, y): f"{table[n][x]:.1f}" for y, n in enumerate(ROBOTS) for x in range(5)}
@@ -183,7 +183,7 @@ def test_nothing_to_draw_is_said(picture: Picture, tmp_path: Path):
 def test_few_colours_keep_the_pictures_colours(results: Results, tmp_path: Path):
     save_png(figure_4_4(results), tmp_path / "few.png")
     image = matplotlib.image.imread(tmp_path / "few.png")[..., :3]
-    for colour, _, _ in METHOD_STYLES.values():
+    for colour, *_ in STYLES[:3]:
         near = np.abs(image - np.array(matplotlib.colors.to_rgb(colour))).max(axis=-1) < 0.03
         assert near.sum() > 500, colour
 

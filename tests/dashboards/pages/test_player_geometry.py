@@ -53,7 +53,7 @@ def test_ellipses_are_those_of_the_state(browser: Any, episode: Episode, tmp_pat
         for group in range(config.groups):
             drawn = page.execute_script("return ellipseOf(arguments[0])", group)
             left_out = left_out_of(episode.learner, params)
-            minor, major, x, y, turn = group_ellipse(group, pos_x, pos_y, left_out, params)
+            minor, major, x, y, turn = group_ellipse(group * 4, (group + 1) * 4, pos_x, pos_y, left_out, params)
             seen = [drawn[name] for name in ("minor", "major", "x", "y")]
             np.testing.assert_allclose(seen, [minor, major, x, y], atol=0.002)
             assert abs(np.sin(drawn["turn"] - turn)) < 0.02  # half a turn more is the same ellipse

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from actors.evaluation.trajectory import Episode
-from dashboards.analysis.aggregate import GROUPS, METHOD_NAMES, ROBOTS, Results, Setup
+from dashboards.analysis.aggregate import GROUPS, ROBOTS, Results, Setup
 from dashboards.analysis.claims import judge
+from dashboards.analysis.methods import DISSERTATION, method_label
 from dashboards.pages.player import player_data
 from dashboards.pages.report_page import Contents, EpisodeGroup, TablePart, report_data, report_page
 from dashboards.plotly_charts.result_charts import failure_causes, heatmaps, transfers
@@ -115,8 +116,8 @@ def test_title_is_text(page: Any):
 
 def test_maps_draw_every_cell(page: Any):
     drawn = plots(page, "success")
-    assert [plot["title"] for plot in drawn] == list(METHOD_NAMES.values())
-    for plot, method in zip(drawn, METHOD_NAMES, strict=True):
+    assert [plot["title"] for plot in drawn] == [method_label(method) for method in DISSERTATION]
+    for plot, method in zip(drawn, DISSERTATION, strict=True):
         rates = [[counted_here(method, Setup(n, m)) for m in GROUPS] for n in ROBOTS]
         assert plot["data"][0]["z"] == [[pytest.approx(rate) for rate in line] for line in rates]
         texts = [f"{100 * rate:.1f}" for line in rates for rate in line]

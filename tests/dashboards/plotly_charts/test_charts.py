@@ -11,7 +11,8 @@ import pytest
 from plotly.colors import sample_colorscale
 
 from actors.evaluation.result_table import ResultRow
-from dashboards.analysis.aggregate import GROUPS, METHOD_NAMES, ROBOTS, Results, Setup
+from dashboards.analysis.aggregate import GROUPS, ROBOTS, Results, Setup
+from dashboards.analysis.methods import DISSERTATION, method_label
 from dashboards.figures.learning_curve import CurvePoint
 from dashboards.pages.assets import asset
 from dashboards.plotly_charts.chart import Chart
@@ -26,7 +27,7 @@ CURVE = [CurvePoint(1000 * i, 0.2 * i, 0.2 * i - 0.1, 0.2 * i + 0.1, FAILED) for
 SPEEDS = [Speed(1000 * i, 5000.0 + i, 100.0 + i) for i in range(1, 6)]
 TRAININGS = [
     Training(f"{method} {setup} s{seed}", method, setup, seed, CURVE, SPEEDS)
-    for method in METHOD_NAMES
+    for method in DISSERTATION
     for setup in (Setup(10, 2), Setup(5, 1))
     for seed in (0, 1)
 ]
@@ -88,7 +89,7 @@ def test_every_choice_has_its_view_and_its_numbers(chart: Chart):
 
 def test_maps_have_the_tables_rates():
     view = heatmaps(PRESETS).views["thesis"]
-    for panel, method in zip(view.panels, METHOD_NAMES, strict=True):
+    for panel, method in zip(view.panels, DISSERTATION, strict=True):
         heat = panel.figure["data"][0]
         for robots, line in zip(ROBOTS, heat["z"], strict=True):
             for groups, share in zip(GROUPS, line, strict=True):
@@ -135,7 +136,7 @@ def test_extrapolation_stands_beside_fixed():
 
 
 def test_failures_and_success_make_one():
-    for panel, method in zip(failure_causes(PRESETS).views["thesis"].panels, METHOD_NAMES, strict=True):
+    for panel, method in zip(failure_causes(PRESETS).views["thesis"].panels, DISSERTATION, strict=True):
         bars = panel.figure["data"]
         assert [bar["name"] for bar in bars] == ["lost", "captured", "collision", "timeout"]
         assert len({bar["marker"]["pattern"]["shape"] for bar in bars}) == 4  # not told by colour alone
@@ -148,7 +149,7 @@ def test_failures_and_success_make_one():
 def test_curves_have_their_intervals_and_a_line_a_seed():
     figure = setup_curves(TRAININGS).views["5r×1g"].panels[0].figure
     assert [trace["name"] for trace in figure["data"][2::3]] == [
-        f"{name} seed {seed}" for name in METHOD_NAMES.values() for seed in (0, 1)
+        f"{name} seed {seed}" for name in map(method_label, DISSERTATION) for seed in (0, 1)
     ]
     low, high, line = figure["data"][:3]
     assert (low["y"], line["y"], high["y"]) == tuple([getattr(p, f) for p in CURVE] for f in ("low", "value", "high"))

@@ -14,9 +14,9 @@ from actors.policy.network import QNetwork, snapshot
 from actors.rollout.vector_env import env_shape
 from learner.config import RunConfig
 from learner.export import write as export
-from learner.export.ports import bare_inputs, bare_outputs, robot_inputs, robot_outputs
+from learner.export.ports import bare_inputs, bare_outputs
 from learner.export.reference_states import observed_states, swarm_states
-from learner.export.robot_policy import BarePolicy, make_robot
+from learner.export.robot_module import BarePolicy, make_robot, robot_class
 from learner.export.write import (
     GOLDEN,
     METADATA,
@@ -34,7 +34,7 @@ from learner.export.write import (
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 from sim_core.methods import make_method
-from tests.learner.export.test_robot_policy import lively
+from tests.learner.export.test_robot_module import lively
 
 WORLDS = {
     "sensor": WorldConfig(robots=5, groups=3),
@@ -51,7 +51,7 @@ def exported(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param) / "export"
     weights = snapshot(network, 0, 0.0)
     states = swarm_states(config, Baseline.FL_ORCA, weights, seed=1, count=300)
-    inputs, outputs = robot_inputs(config), robot_outputs(config)
+    inputs, outputs = robot_class(config).inputs(config), robot_class(config).outputs(config)
     found = write_export(folder, make_robot(network, config), inputs, outputs, {"method": config.method}, states)
     assert found[ONNX].states == found[PROGRAM].states == 300
     return config, folder, swarm_states(config, Baseline.FL_ORCA, weights, seed=800, count=400)
@@ -59,9 +59,13 @@ def exported(request, tmp_path_factory):
 
 def test_both_files_decide_as_simulator_and_policy(exported):
     config, folder, states = exported
+    outputs = [port.name for port in robot_class(config).outputs(config)]
     for file, got in (
         (ONNX, run_onnx(folder / ONNX, states.inputs)),
-        (PROGRAM, run_program(folder / PROGRAM, states.inputs, [port.name for port in robot_outputs(config)])),
+        (
+            PROGRAM,
+            run_program(folder / PROGRAM, states.inputs, outputs),
+        ),
     ):
         found = agreement(got, states.expected)
         assert found.different == 0, file
@@ -89,7 +93,7 @@ def test_the_file_says_what_goes_in_and_out(exported):
 
 def test_any_number_of_robots_fits(exported):
     config, folder, states = exported
-    names = [port.name for port in robot_outputs(config)]
+    names = [port.name for port in robot_class(config).outputs(config)]
     one = {name: array[:1] for name, array in states.inputs.items()}
     if config.method == "sensor":
         few = {name: array[:1, :0] for name, array in states.inputs.items()}
@@ -187,6 +191,6 @@ def test_a_missing_package_is_named(monkeypatch, tmp_path):
 def test_ports_fit_every_method():
     for name, world in WORLDS.items():
         (size,) = make_method(world).observation_shape
-        assert robot_outputs(world)[-1].shape == ("batch", size), name
+        assert robot_class(world).outputs(world)[-1].shape == ("batch", size), name
     faster = dataclasses.replace(WORLDS["out"], learner_speed_limit_m_s=1.5)
-    assert "at most 1.5 m/s" in robot_outputs(faster)[0].meaning
+    assert "at most 1.5 m/s" in robot_class(faster).outputs(faster)[0].meaning

@@ -24,7 +24,9 @@ REAL = np.float32
 def ellipse(pos, group=0, left_out=NOBODY, **settings):
     """(a, b, x_c, y_c, theta) of positions `[num_robots, 2]`."""
     config = WorldConfig(**({"method": "out", "robots": len(pos), "groups": 1, "arena_radius_m": 60.0} | settings))
-    return group_ellipse(group, *np.ascontiguousarray(np.asarray(pos, REAL).T), left_out, ellipse_params(config))
+    begin = group * config.robots
+    pos_x, pos_y = np.ascontiguousarray(np.asarray(pos, REAL).T)
+    return group_ellipse(begin, begin + config.robots, pos_x, pos_y, left_out, ellipse_params(config))
 
 
 def test_eq_4_5_and_4_6_by_hand():
@@ -143,7 +145,8 @@ def test_one_robot_alone_has_the_smallest_ellipse():
 def own(pos, learner, robots, **settings):
     settings = {"method": "out", "robots": robots, "groups": len(pos) // robots, "arena_radius_m": 60.0} | settings
     params = ellipse_params(WorldConfig(**settings))
-    return in_own_ellipse(learner, *np.ascontiguousarray(np.asarray(pos, REAL).T), params)
+    begin = learner // robots * robots
+    return in_own_ellipse(learner, begin, begin + robots, *np.ascontiguousarray(np.asarray(pos, REAL).T), params)
 
 
 def test_the_own_group_is_the_learning_robots():

@@ -8,9 +8,10 @@ import pytest
 
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
-from sim_core.methods import METHODS, make_method
+from sim_core.methods import make_method
 from sim_core.methods.m_sensor import COUNT_LIMIT, heading_velocities, sector_edges, sector_of
 from sim_core.outcomes import Outcome
+from sim_core.plugins import METHODS
 from sim_core.state import empty_state
 
 REAL = np.float32
@@ -262,4 +263,5 @@ def test_the_task_comes_before_the_clock(mate, goal, expected, make_state):
 
 
 def test_every_method_has_a_name_that_the_configuration_takes():
-    assert all(isinstance(make_method(WorldConfig(method=name)), kind) for name, kind in METHODS.items())
+    labels = {name: make_method(WorldConfig(method=name)).label for name in METHODS.built_in}
+    assert labels == {"sensor": "M_sensor", "in": "M_IN", "out": "M_OUT"}

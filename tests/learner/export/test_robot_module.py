@@ -8,8 +8,9 @@ import torch
 
 from actors.policy.baselines import Baseline
 from actors.policy.network import QNetwork, snapshot
+from learner.export.ellipse_methods import NO_DECISION, InsideRobot, OutsideRobot, RepulsiveField
 from learner.export.reference_states import swarm_states
-from learner.export.robot_policy import NO_DECISION, EllipseRobot, RepulsiveField, make_robot
+from learner.export.robot_module import make_robot
 from sim_core.config import WorldConfig
 from sim_core.methods import make_method
 from sim_core.methods.apf import field_params, repulsion
@@ -111,7 +112,7 @@ def test_a_full_ellipse_is_that_of_its_eigenvectors():
     positions = rng.normal(size=(200, 2, 6, 2)).astype(np.float32)
     mask = np.ones((200, 2, 6), bool)
     mask[:, 0, 5] = False
-    robot = EllipseRobot(lively(config), config)
+    robot = InsideRobot(lively(config), config)
     seen = decide(robot, positions, mask, np.zeros((200, 2, 2), np.float32))["observation"].reshape(200, 2, 9)
     for i in range(200):
         for group in range(2):
@@ -132,7 +133,7 @@ def test_a_full_ellipse_is_that_of_its_eigenvectors():
 )
 def test_the_angle_at_its_edges(shared, half, expected):
     config = WorldConfig(method="out", ellipse_covariance="full")
-    robot = EllipseRobot(lively(config), config)
+    robot = OutsideRobot(lively(config), config)
     found = robot._angle(torch.tensor([shared], dtype=torch.float64), torch.tensor([half], dtype=torch.float64))
     assert found.item() == pytest.approx(expected, abs=1e-7)
 

@@ -1,113 +1,29 @@
-"""The learning robot's whole decision as one torch module: what it senses to the velocity it drives.
+"""M_IN's and M_OUT's decisions as torch modules (see `robot_module`).
 
-These modules compute what the simulator's `perceive` and `velocity` compute around the Q-network, for use outside
-the simulator. They take positions relative to the robot (metres, along the axes of the world that the goals and
-headings are in), of any number of robots: unused places are masked. They can be exported: no loop over
-robots, no branch on data. Arithmetic is the simulator's: float32 where its arrays are, float64 in between.
-
-Where M_IN or M_OUT is given a group of which it knows no robot, there is no ellipse and so no decision: the action
-is NO_DECISION and the velocity zero.
+Where a group is given of which the robot knows no robot, there is no ellipse and so no decision: the action is
+NO_DECISION and the velocity zero.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from actors.policy.network import QNetwork
+from learner.export.ports import Port
+from learner.export.robot_module import Decision, RobotModule, relative_positions
 from sim_core.config import WorldConfig
 from sim_core.methods.apf import NEAREST_M, field_params
 from sim_core.methods.ellipse import ellipse_params
-from sim_core.methods.group_ellipses import observation_limit
-from sim_core.methods.headings import heading_velocities
-from sim_core.methods.m_sensor import COUNT_LIMIT, sector_edges
+from sim_core.methods.group_ellipses import COLUMN_NAMES, observation_limit
+from sim_core.worlds import WorldBatch
 
 NO_DECISION = -1
 """Action where the state cannot be formed."""
-
-
-Decision = tuple[Tensor, Tensor, Tensor, Tensor]
-"""What a module gives: velocity `[batch, 2]` float32 (m/s), action `[batch]` int64, action values `[batch, actions]`
-float32, and the observation `[batch, size]` float32 that the network saw. Plain: a saved program needs no class.
-"""
-
-
-class BarePolicy(nn.Module):
-    """Observation to action values and the greedy action, for any environment.
-
-    Args:
-      network: the trained network.
-    """
-
-    def __init__(self, network: QNetwork) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """(action `[batch]` int64, action values `[batch, actions]`) of observations `[batch, *shape]`."""
-        values = self.network(observation)
-        return values.argmax(1), values
-
-
-class SensorRobot(nn.Module):
-    """M_sensor: counts of robots per sector and region (3.2.1), greedy action, velocity u_nn.
-
-    Args:
-      network: the trained network.
-      config: the world that it was trained in.
-    """
-
-    radii_sq: Tensor
-    edges: Tensor
-    cells: Tensor
-    headings: Tensor
-
-    def __init__(self, network: QNetwork, config: WorldConfig) -> None:
-        super().__init__()
-        self.network = network
-        self.sectors = config.sectors
-        self.separate = config.sensor_counts == "separate"
-        radii = torch.tensor([config.inner_radius_m, config.outer_radius_m], dtype=torch.float32)
-        self.register_buffer("radii_sq", radii * radii)
-        self.register_buffer("edges", torch.from_numpy(sector_edges(config.sectors)))
-        self.register_buffer("cells", torch.arange(2 * config.sectors))
-        self.register_buffer("headings", torch.from_numpy(heading_velocities(config, "float32")))
-
-    def _cells(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """(cell `[batch, robots]` int64, whether it is within R2): inner disc 0..q-1, ring q..2q-1."""
-        dx, dy = positions[..., 0], positions[..., 1]
-        distance_sq = dx * dx + dy * dy
-        x, y = dx.double().unsqueeze(-1), dy.double().unsqueeze(-1)
-        left = self.edges[:, 0] * y - self.edges[:, 1] * x >= 0.0
-        half = (self.sectors + 1) // 2  # the first edge at or above angle 0
-        above = half - 1 + left[..., half:].sum(-1)
-        below = left[..., 1:half].sum(-1)
-        ring = torch.where(distance_sq < self.radii_sq[0], 0, self.sectors)
-        return torch.where(dy >= 0.0, above, below) + ring, distance_sq < self.radii_sq[1]
-
-    def _counts(self, positions: Tensor, mask: Tensor) -> Tensor:
-        """Robots per cell `[batch, 2q]` float32."""
-        cell, near = self._cells(torch.where(mask.unsqueeze(-1), positions, 0.0))
-        here = (cell.unsqueeze(-1) == self.cells) & (near & mask).unsqueeze(-1)
-        return here.float().sum(1)
-
-    def forward(self, own: Tensor, own_mask: Tensor, other: Tensor, other_mask: Tensor) -> Decision:
-        """Decides for a batch of robots.
-
-        Args:
-          own: relative positions `[batch, own robots, 2]` float32 of robots of the own group, itself left out.
-          own_mask: `[batch, own robots]` bool, False where there is no robot.
-          other: relative positions `[batch, other robots, 2]` float32 of robots of other groups.
-          other_mask: `[batch, other robots]` bool.
-        """
-        mates, others = self._counts(own, own_mask), self._counts(other, other_mask)
-        counts = torch.cat([mates, others], dim=1) if self.separate else mates - others
-        observation = counts.clamp(-COUNT_LIMIT, COUNT_LIMIT)
-        values = self.network(observation)
-        action = values.argmax(1)
-        return self.headings[action], action, values, observation
 
 
 class RepulsiveField(nn.Module):
@@ -142,8 +58,8 @@ def shortened(vector: Tensor, limit: float) -> Tensor:
     return torch.where(length <= limit, vector, vector * (limit / length.clamp(min=limit)))
 
 
-class EllipseRobot(nn.Module):
-    """M_IN and M_OUT: one ellipse a group (4.2.1), greedy action, velocity u_nn, in M_OUT with u_apf added.
+class EllipseRobot(RobotModule):
+    """What M_IN and M_OUT share: one ellipse a group (4.2.1), greedy action.
 
     Args:
       network: the trained network.
@@ -151,12 +67,11 @@ class EllipseRobot(nn.Module):
     """
 
     counted: Tensor
-    headings: Tensor
     places: Tensor
+    undecided = "; -1 and no velocity where a group has no robot"
 
     def __init__(self, network: QNetwork, config: WorldConfig) -> None:
-        super().__init__()
-        self.network = network
+        super().__init__(network, config)
         self.config = config
         self.ellipse = ellipse_params(config)
         self.field = RepulsiveField(config)
@@ -164,8 +79,36 @@ class EllipseRobot(nn.Module):
         counted = torch.zeros(config.groups, dtype=torch.float64)
         counted[0] = float(self.ellipse.counts_learner)
         self.register_buffer("counted", counted)  # the robot itself, in the ellipse of its own group
-        self.register_buffer("headings", torch.from_numpy(heading_velocities(config, "float32")))
         self.register_buffer("places", torch.arange(config.groups))
+
+    @classmethod
+    def inputs(cls, config: WorldConfig) -> list[Port]:
+        """Relative positions of every group's robots with their mask, and the groups' goals."""
+        around = "in their order around the start circle, from the own one on"
+        order = "in any order" if config.group_order == "nearest" else around
+        groups = f"group 0 is the own one, without the robot itself; the others {order}"
+        meaning = f"relative positions of all robots of every group: {groups}"
+        unused = "False where a place is not used; its position then does not count; every group needs one robot"
+        return [
+            Port("positions", "float32", ("batch", config.groups, "robots", 2), "m", meaning),
+            Port("mask", "bool", ("batch", config.groups, "robots"), "", unused),
+            Port("goals", "float32", ("batch", config.groups, 2), "m", "relative positions of the groups' goals"),
+        ]
+
+    @classmethod
+    def observation_meaning(cls, config: WorldConfig) -> str:
+        """Rows of groups."""
+        columns = len(config.method_class.observation_names(config)) // config.groups
+        return (
+            f"rows of groups, each {', '.join(COLUMN_NAMES[:columns])}; lengths of ellipses × "
+            f"{config.ellipse_scale_per_m} per m, goals × {config.goal_scale_per_m} per m, theta in rad"
+        )
+
+    @classmethod
+    def sense(cls, worlds: WorldBatch) -> dict[str, NDArray[Any]]:
+        """All groups' robots and goals, the own group first."""
+        relative, mask, goals = relative_positions(worlds)
+        return {"positions": relative, "mask": mask, "goals": goals}
 
     def _centres(self, positions: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         """(centres `[batch, groups, 2]`, robots `[batch, groups]` that count): the robot itself stands at 0."""
@@ -197,21 +140,13 @@ class EllipseRobot(nn.Module):
         tangent = torch.where(half >= 0.0, shared / (root + half), (root - half) / shared)
         return torch.where(root == 0.0, 0.0, torch.atan(tangent.float()).double())
 
-    def _fields(self, positions: Tensor, mask: Tensor) -> Tensor:
-        """u_apf of every row `[batch, groups, 2]` float64."""
-        total = self.field.parts(positions, mask).sum(2)
-        if self.config.apf_rows == "all":
-            total = total.sum(1, keepdim=True).expand_as(total)
-        return self.field.limited(total)
-
     def _matrix(self, positions: Tensor, mask: Tensor, goals: Tensor) -> Tensor:
         """The state matrix `[batch, groups, columns]` float32, rows in the order of the input."""
         config, wide = self.config, positions.double()
         ellipses = self._ellipses(wide, mask)
         scaled = torch.cat([ellipses[..., :4] * config.ellipse_scale_per_m, ellipses[..., 4:]], dim=-1)
         parts = [scaled, goals.double() * config.goal_scale_per_m]
-        if config.method == "in":
-            parts.append(self._fields(positions, mask))
+        parts += self._more_columns(positions, mask)
         return torch.cat(parts, dim=-1).float().clamp(-self.limit, self.limit)
 
     def _nearest_first(self, matrix: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
@@ -225,12 +160,13 @@ class EllipseRobot(nn.Module):
         chosen = rank.unsqueeze(1) == self.places.unsqueeze(1)  # [batch, place, group]
         return torch.where(chosen.unsqueeze(-1), matrix.unsqueeze(1), 0.0).sum(2)
 
+    def _more_columns(self, positions: Tensor, mask: Tensor) -> list[Tensor]:
+        """Columns `[batch, groups, columns]` float64 behind those of the ellipses and goals."""
+        return []
+
     def _velocity(self, action: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
-        velocity = self.headings[action]
-        if self.config.method == "out":
-            total = self.field.parts(positions, mask).sum((1, 2))
-            velocity = shortened(velocity + self.field.limited(total), self.config.learner_speed_limit_m_s).float()
-        return velocity
+        """The velocity `[batch, 2]` float32 of an action: u_nn."""
+        return self.headings[action]
 
     def forward(self, positions: Tensor, mask: Tensor, goals: Tensor) -> Decision:
         """Decides for a batch of robots.
@@ -253,6 +189,32 @@ class EllipseRobot(nn.Module):
         return velocity, torch.where(known, action, NO_DECISION), values, observation
 
 
-def make_robot(network: QNetwork, config: WorldConfig) -> SensorRobot | EllipseRobot:
-    """The module of the world's method."""
-    return SensorRobot(network, config) if config.method == "sensor" else EllipseRobot(network, config)
+class InsideRobot(EllipseRobot):
+    """M_IN: u_apf is part of the state, velocity u_nn.
+
+    Args:
+      network: the trained network.
+      config: the world that it was trained in.
+    """
+
+    def _more_columns(self, positions: Tensor, mask: Tensor) -> list[Tensor]:
+        """u_apf of every row `[batch, groups, 2]` float64."""
+        total = self.field.parts(positions, mask).sum(2)
+        if self.config.apf_rows == "all":
+            total = total.sum(1, keepdim=True).expand_as(total)
+        return [self.field.limited(total)]
+
+
+class OutsideRobot(EllipseRobot):
+    """M_OUT: velocity u_nn + u_apf.
+
+    Args:
+      network: the trained network.
+      config: the world that it was trained in.
+    """
+
+    def _velocity(self, action: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
+        """The velocity `[batch, 2]` float32 of an action: u_nn + u_apf, no faster than the limit."""
+        total = self.field.parts(positions, mask).sum((1, 2))
+        velocity = self.headings[action] + self.field.limited(total)
+        return shortened(velocity, self.config.learner_speed_limit_m_s).float()
