@@ -158,7 +158,7 @@ class WorldConfig:
         _take_source(self, METHODS)
         _take_source(self, SCENES)
         _check_counts(self)
-        object.__setattr__(self, "_group_sizes", _group_sizes(self))
+        _check_group_sizes(self)
         _check_lengths(self)
         self.scene_class.check(self)
         self.method_class.check(self)
@@ -171,8 +171,7 @@ class WorldConfig:
     @property
     def group_sizes(self) -> tuple[int, ...]:
         """Robots of each group, as the scene has them."""
-        sizes: tuple[int, ...] = self.__dict__["_group_sizes"]
-        return sizes
+        return tuple(int(size) for size in self.scene_class.group_sizes(self))
 
     @property
     def method_class(self) -> type[Method]:
@@ -229,7 +228,7 @@ def _take_source(config: WorldConfig, kind: Kind) -> None:
     load(kind, name, getattr(config, f"{kind.setting}_source"))
 
 
-def _group_sizes(config: WorldConfig) -> tuple[int, ...]:
+def _check_group_sizes(config: WorldConfig) -> None:
     require(
         config.robots * config.groups <= MAX_ROBOTS,
         f"robots × groups is {config.robots * config.groups}; at most {MAX_ROBOTS} robots fit one world: lower robots "
@@ -237,12 +236,11 @@ def _group_sizes(config: WorldConfig) -> tuple[int, ...]:
     )
     scene = config.scene_class
     with guarded(scene, "group_sizes"):
-        sizes = tuple(int(size) for size in scene.group_sizes(config))
+        sizes = config.group_sizes
     require(
         len(sizes) == config.groups and min(sizes) >= 2 and sum(sizes) <= MAX_ROBOTS,
         f"scene {scene.__name__} must have groups ({config.groups}) sizes of at least 2 robots, not {sizes}",
     )
-    return sizes
 
 
 def _check_counts(config: WorldConfig) -> None:

@@ -22,9 +22,9 @@ from rich.console import Console
 from rich.table import Table
 
 from tests.benchmarks import exactness_work as work
+from tests.sim_core.orca_scenes import KINDS
 from tests.sim_core.parity import BOUND_M_S, SETTINGS, Parity, total
 from tests.sim_core.precision import DRIFT_STEPS
-from tests.sim_core.scenes import KINDS
 
 CONSOLE = Console(width=160)
 SWARM_SETUPS = [(robots, groups) for robots in (5, 10, 15, 20, 25) for groups in (1, 2, 3, 4, 8)]

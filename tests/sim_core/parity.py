@@ -19,7 +19,7 @@ import numpy as np
 import pyrvo
 
 from tests.sim_core.kernels import orca_velocities
-from tests.sim_core.scenes import Scene, tie_margin_sq
+from tests.sim_core.orca_scenes import Scene, tie_margin_sq
 
 BOUND_M_S = 1e-5
 """Largest difference from RVO2 in either component."""

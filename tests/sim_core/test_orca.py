@@ -6,17 +6,7 @@ import pytest
 from sim_core.config import WorldConfig
 from sim_core.worlds import WorldBatch
 from tests.sim_core.kernels import orca_velocities
-from tests.sim_core.parity import (
-    BOUND_M_S,
-    SETTINGS,
-    compare,
-    rvo2_half_planes,
-    rvo2_step,
-    rvo2_velocities,
-    total,
-    worst_violation,
-)
-from tests.sim_core.scenes import (
+from tests.sim_core.orca_scenes import (
     GENERIC_KINDS,
     KINDS,
     Scene,
@@ -26,6 +16,16 @@ from tests.sim_core.scenes import (
     numbered_scene,
     tie_margin_sq,
     world_scene,
+)
+from tests.sim_core.parity import (
+    BOUND_M_S,
+    SETTINGS,
+    compare,
+    rvo2_half_planes,
+    rvo2_step,
+    rvo2_velocities,
+    total,
+    worst_violation,
 )
 
 MAX_SPEED_M_S, HORIZON_S = 1.0, 2.0

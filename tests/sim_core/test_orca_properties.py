@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.sim_core.kernels import orca_velocities
-from tests.sim_core.scenes import (
+from tests.sim_core.orca_scenes import (
     GENERIC_KINDS,
     KINDS,
     Scene,

@@ -10,8 +10,8 @@ import pytest
 
 from sim_core.config import WorldConfig
 from sim_core.worlds import WorldBatch
+from tests.sim_core.orca_scenes import KINDS, numbered_scene, world_scene
 from tests.sim_core.precision import drifts, one_step_difference
-from tests.sim_core.scenes import KINDS, numbered_scene, world_scene
 
 
 @pytest.mark.parametrize("kind", KINDS)

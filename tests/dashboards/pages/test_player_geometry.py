@@ -16,8 +16,8 @@ from sim_core.methods.ellipse import ellipse_params, group_ellipse, left_out_of
 from sim_core.methods.headings import heading_velocities
 from tests.dashboards.chromium import complaints, wait_until
 from tests.dashboards.conftest import record_episode
+from tests.sim_core.orca_scenes import Scene
 from tests.sim_core.parity import rvo2_half_planes, rvo2_step, worst_violation
-from tests.sim_core.scenes import Scene
 
 OUT = WorldConfig(robots=4, groups=3, method="out")
 STEPS = (1, 40, 90)

@@ -188,7 +188,7 @@ def test_results_of_more_episodes_do_as_well():
     [
         ({"robots": ()}, "robots must have at least one"),
         ({"seeds": (1, 1)}, "seeds must not repeat"),
-        ({"methods": ("sensor", "north")}, "methods must be among sensor, in, out"),
+        ({"methods": ("sensor", "north")}, "method must be one of: sensor, in, out"),
         ({"episodes": 0}, "episodes must be at least 1"),
         ({"extrapolation_episodes": 0}, "extrapolation_episodes must be at least 1"),
         ({"env_steps": 0}, "env_steps must be at least 1"),

@@ -9,7 +9,8 @@ import pytest
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 from sim_core.methods import make_method
-from sim_core.methods.m_sensor import COUNT_LIMIT, heading_velocities, sector_edges, sector_of
+from sim_core.methods.headings import heading_velocities
+from sim_core.methods.m_sensor import COUNT_LIMIT, sector_edges, sector_of
 from sim_core.outcomes import Outcome
 from sim_core.plugins import METHODS
 from sim_core.state import empty_state
