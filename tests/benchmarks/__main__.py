@@ -22,7 +22,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--rvo2", type=Path, action="append", default=[], metavar="PATH", help="a built rvo2_driver; may be repeated"
     )
-    parser.add_argument("--picture", action="store_true", help="`scaling` draws the README's picture of the model anew")
+    parser.add_argument(
+        "--picture", action="store_true", help="`scaling` draws the picture of the model in this folder's README anew"
+    )
     options = parser.parse_args(arguments)
     for name in options.names:
         if name not in BENCHMARKS:

@@ -13,7 +13,7 @@
 //   once robots          followed by x y vx vy pref_x pref_y of every robot of one world
 //                        -> vx vy of every robot after one step, one a line
 //
-// Built together with RVO2's own sources into one program; the README has the line.
+// Built together with RVO2's own sources into one program; the README beside this file has the command.
 
 #include <chrono>
 #include <cmath>

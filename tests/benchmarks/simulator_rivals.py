@@ -189,7 +189,7 @@ def velocities(worlds: WorldBatch):
 
 def orca_table(rvo2: Sequence[Path]) -> Table | str:
     if not rvo2:
-        return "orca: needs RVO2's C++ driver, --rvo2 PATH; the README's section on benchmarks tells how to build it\n"
+        return "orca: needs RVO2's C++ driver, --rvo2 PATH; tests/benchmarks/README.md tells how to build it\n"
     table = Table(
         title=f"ORCA alone against RVO2 in C++, {NUM_WORLDS} worlds\n"
         f"million robot steps/s, one core, median (lowest … highest) of {ROUNDS}",

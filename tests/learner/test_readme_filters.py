@@ -1,4 +1,4 @@
-"""The filters that the README tells a user to type into MLflow's search box do what it says."""
+"""The filters that dashboards/README.md suggests for MLflow's search box find what it says."""
 
 import re
 from pathlib import Path
@@ -48,8 +48,8 @@ def names(store, tmp_path_factory):
 
 
 def readme_filters():
-    text = (Path(__file__).parents[2] / "README.md").read_text()
-    table = text.split("### Comparing runs in MLflow")[1].split("### ")[0]
+    text = (Path(__file__).parents[2] / "dashboards" / "README.md").read_text()
+    table = text.split("## Comparing runs in MLflow")[1].split("## ")[0]
     return [code.strip("`") for code in re.findall(r"^\| (`+.*?`+) \|", table, re.MULTILINE)]
 
 

@@ -1,4 +1,4 @@
-"""The table of metrics: complete, in Prometheus' words, and the same on the operator's page."""
+"""The table of metrics: complete, valid names for Prometheus, and the same in learner/README.md."""
 
 import re
 from contextlib import closing
@@ -9,12 +9,12 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from learner.config import RunConfig
 from learner.loop import TrainingLoop
-from learner.tracking.journal import Journal
+from learner.tracking.journal import Journal, charted
 from learner.tracking.metric_names import ENV_STEPS, METRICS
 from learner.training.cluster import process_cluster
 from tests.checkpointing import Silent
 
-PAGE = Path(__file__).parents[3] / "deploy" / "README.md"
+README = Path(__file__).parents[3] / "learner" / "README.md"
 
 
 def journal_names(config: RunConfig, folder: Path) -> set[str]:
@@ -60,8 +60,18 @@ def test_names_are_prometheus_names_and_stand_once():
         assert (known.unit + known.meaning).isascii(), "Ray's descriptions are ASCII"
 
 
-def test_the_operators_page_has_the_table():
-    lines = PAGE.read_text().splitlines()
-    start = lines.index("| metric | unit | meaning | healthy | in the journal |") + 2
-    rows = [f"| `{m.series}` | {m.unit} | {m.meaning} | {m.healthy} | `{m.journal}` |" for m in METRICS]
+def in_mlflow(journal: str) -> str:
+    """What the README says of a metric: whether MLflow has it, whose step is the count of env steps."""
+    if journal == ENV_STEPS:
+        return "step"
+    return "yes" if charted({journal: 0.0}) else ""
+
+
+def test_the_readme_has_the_table():
+    lines = README.read_text().splitlines()
+    start = lines.index("| metric | in MLflow | in Prometheus | unit | meaning | healthy |") + 2
+    rows = [
+        f"| `{m.journal}` | {in_mlflow(m.journal)} | `{m.series}` | {m.unit} | {m.meaning} | {m.healthy} |"
+        for m in METRICS
+    ]
     assert lines[start : start + len(rows) + 1] == [*rows, ""]
