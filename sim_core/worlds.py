@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -141,6 +142,27 @@ class WorldBatch:
             array[...] = saved[name]
         self.method.perceive(self.state, self._all, self._observation)
         return self._observation.copy()
+
+
+REHEARSAL_WORLDS, REHEARSAL_STEPS = 16, 20
+
+
+@functools.lru_cache(maxsize=64)
+def rehearse(config: WorldConfig) -> None:
+    """Plays a little in a world with a user's own method or scene, so that what is wrong with it shows at once.
+
+    Raises:
+      PluginError: the user's code raises, or gives what it must not give; the message names its file and line.
+    """
+    if not (config.method_source or config.scene_source):
+        return
+    worlds = WorldBatch(config, REHEARSAL_WORLDS)
+    worlds.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(REHEARSAL_STEPS):
+        done = is_done(worlds.step(rng.integers(config.num_actions, size=REHEARSAL_WORLDS)).outcome)
+        if done.any():
+            worlds.reset(done)
 
 
 def is_done(outcome: NDArray[np.int8]) -> NDArray[np.bool_]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sim_core import ENV_ID
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
+from sim_core.worlds import rehearse
 
 
 class EnvSpec(NamedTuple):
@@ -84,7 +85,13 @@ class EnvShape(NamedTuple):
 
 
 def env_shape(spec: EnvSpec) -> EnvShape:
-    """The spaces of `spec`, found by making one environment."""
+    """The spaces of `spec`, found by making one environment; a user's own method or scene is rehearsed first.
+
+    Raises:
+      ConfigError: see `make_vector_env`, or the rehearsal shows an error in the user's code.
+    """
+    if spec.is_swarm:
+        rehearse(spec.world)
     env = make_vector_env(spec, 1)
     try:
         return spaces_of(env)
