@@ -1,4 +1,4 @@
-"""Refusing bad settings: the error, and a check of a config's fields against their annotations."""
+"""The error for invalid settings, and a check of a config's fields against their annotations."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 
 class ConfigError(Exception):
-    """A setting that cannot work; the message says what, where and how to mend it."""
+    """An invalid setting. The message names the setting, its value and a fix."""
 
 
 def require(condition: bool, message: str) -> None:
@@ -19,10 +19,10 @@ def require(condition: bool, message: str) -> None:
 
 
 def check_fields(config: Any) -> None:
-    """Checks a config dataclass's bool, int, float, str and Literal fields; others are their owner's to check.
+    """Checks the bool, int, float, str and Literal fields of a config dataclass; it ignores fields of other types.
 
     Raises:
-      ConfigError: a value is not of its field's type, not finite, or none of its choices.
+      ConfigError: a value has the wrong type, is not finite, or is none of its field's choices.
     """
     hints = typing.get_type_hints(type(config))
     for field in dataclasses.fields(config):
@@ -37,7 +37,7 @@ def check_fields(config: Any) -> None:
         elif wanted is float:
             require(_is_finite_number(value), f"{field.name} must be a finite number, not {value!r}")
         elif wanted in (bool, str):
-            name = "true or false" if wanted is bool else "a text"
+            name = "true or false" if wanted is bool else "a string"
             require(isinstance(value, wanted), f"{field.name} must be {name}, not {value!r}")
 
 
@@ -46,5 +46,5 @@ def _is_finite_number(value: Any) -> bool:
         return False
     try:
         return math.isfinite(value)
-    except OverflowError:  # a whole number beyond float's range
+    except OverflowError:  # an int beyond the range of float
         return False

@@ -1,8 +1,9 @@
-"""Compiler options of every kernel, in one place.
+"""The compiler options of every kernel, and the folder where compiled kernels are cached.
 
-Numba caches compiled kernels on disk, but it notices changes of a kernel's own file only: one that takes in kernels
-of other files would go on with their old code. The cache therefore lies in a folder that is named after the content of
-all sources of this package, and of those of its neighbours that have kernels; changed sources start an empty one.
+Numba caches a compiled kernel on disk and compiles it again when the kernel's own file changes. It does not notice
+changes in other files, so a kernel that inlines kernels of another file would keep their old code. The cache folder is
+therefore named after a hash of all sources that can hold kernels: every file of this package and every file of
+`KERNEL_PACKAGES` that imports this module, subfolders included. A change in any of them starts an empty cache folder.
 """
 
 from __future__ import annotations
@@ -16,19 +17,20 @@ import numba
 from numba import njit
 
 JIT_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": True, "_nrt": False}
-"""Cached on disk, IEEE division, no fastmath, and without numba's run-time, so that a kernel cannot allocate."""
-NEIGHBOURS = ("actors", "learner")
-"""Packages beside this one that have kernels, too."""
+"""On-disk cache, IEEE division, no fastmath. Without numba's run-time (NRT) a kernel cannot allocate memory."""
+KERNEL_PACKAGES = ("actors", "learner")
+"""The other packages with kernels. They lie beside this one."""
 
 
 def _cache_folder() -> str:
-    """Folder of this version's compiled kernels: beside the sources, or else in the user's cache.
+    """Folder of the kernels that were compiled from the present sources.
 
-    Numba's own setting NUMBA_CACHE_DIR, where given, takes the place of either.
+    It lies beside the sources if that folder is writable, else in the user's cache folder. Numba's own setting
+    NUMBA_CACHE_DIR takes precedence over both.
     """
     package = Path(__file__).parent
     digest = hashlib.sha256()
-    for folder in (package, *(package.parent / name for name in NEIGHBOURS)):
+    for folder in (package, *(package.parent / name for name in KERNEL_PACKAGES)):
         for source in sorted(folder.rglob("*.py")):
             content = source.read_bytes()
             if folder == package or b"sim_core.jit" in content:
@@ -40,28 +42,28 @@ def _cache_folder() -> str:
 
 
 CACHE_FOLDER = _cache_folder()
-"""Where this version's compiled kernels lie."""
+"""The folder of this version's compiled kernels."""
 
 
 def _compiled(function: Any, **options: Any) -> Any:
-    theirs = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = CACHE_FOLDER  # read while the kernel is made; other users of numba keep their setting
+    previous = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = CACHE_FOLDER  # read when the dispatcher is created; other users of numba keep theirs
     try:
         return njit(**(JIT_OPTIONS | options))(function)
     finally:
-        numba.config.CACHE_DIR = theirs
+        numba.config.CACHE_DIR = previous
 
 
 def kernel(function: Any) -> Any:
-    """Compiles `function`, called from Python, with the project's options."""
+    """Compiles a function that Python calls, with the project's options."""
     return _compiled(function)
 
 
 def inlined(function: Any, **options: Any) -> Any:
-    """Compiles `function` as a part of the kernels that call it, each of which takes it in whole."""
+    """Compiles a function that only kernels call; it is inlined into each of them."""
     return _compiled(function, forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
 
 
-def product(function: Any) -> Any:
-    """Compiles `function` as `inlined` does, but with numba's run-time: `np.dot`, numba's way to BLAS, needs it."""
+def inlined_blas(function: Any) -> Any:
+    """Compiles as `inlined` does, but with numba's run-time (NRT), which `np.dot` needs to call BLAS."""
     return inlined(function, _nrt=True)

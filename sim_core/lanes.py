@@ -1,13 +1,14 @@
-"""SIMD vectors for numba kernels: eight numbers that are computed together, one a lane.
+"""SIMD vectors for numba kernels: a vector holds eight numbers, one per lane.
 
-Numba's compiler does not turn the branchy loops of ORCA into vector code by itself. This small extension type
-does: `LanesType(element)` is LLVM's `<8 x element>`, which LLVM lowers to the registers of whatever
-processor it runs on. Kernels then read like scalar ones: `+ - * /`, comparisons, `& | ~` work lane by lane
-(a scalar stands for eight equal lanes), `select` takes the place of `if`, and `any_lane` asks whether a
-branch is worth entering. Elements are float32, float64, int32 or, for masks, bool. Division and square root
-are IEEE's: a lane computes, bit for bit, what scalar code would. NaN compares false in every lane.
+LLVM does not vectorise the branchy loops of ORCA by itself. The extension type `LanesType(element)` makes the vectors
+explicit: it is LLVM's `<8 x element>`, which LLVM lowers to the vector registers of the processor.
 
-Arrays are addressed flat: vector i of an array is its elements 8 i to 8 i + 7.
+Kernels read like scalar code. `+ - * /`, comparisons and `& | ~` work lane by lane; a scalar operand is broadcast to
+all lanes. `select` replaces `if`, and `any_lane` tells whether any lane needs a branch. Elements are float32, float64,
+int32 or, in masks, bool. Division and square root are IEEE 754's, so each lane gives the bits that scalar code would
+give. Comparisons are ordered: with NaN every comparison is false, `!=` included.
+
+Arrays are indexed flat: vector i of an array consists of its elements 8 i to 8 i + 7.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from numba.core import cgutils
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
 LANES = 8
-"""Numbers in a vector: one 256-bit register of float32."""
+"""Lanes of a vector: float32 fills one 256-bit register."""
 
 
 class LanesType(types.Type):
-    """Numba's type of a vector of `LANES` numbers of the numba type `element`."""
+    """The numba type of a vector of `LANES` numbers of the numba type `element`."""
 
     def __init__(self, element: Any) -> None:
         self.element = element
@@ -50,31 +51,31 @@ def _splat(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), order)
 
 
-def _as_lanes(context: Any, builder: Any, value: Any, given: Any, element: Any) -> Any:
-    """`value` of numba type `given` as a vector of `element`; a scalar is repeated."""
-    if isinstance(given, LanesType):
+def _broadcast(context: Any, builder: Any, value: Any, numba_type: Any, element: Any) -> Any:
+    """Returns `value`, of type `numba_type`, as a vector of `element`; a scalar is repeated in every lane."""
+    if isinstance(numba_type, LanesType):
         return value
-    return _splat(builder, context.cast(builder, value, given, element))
+    return _splat(builder, context.cast(builder, value, numba_type, element))
 
 
-def _element(*arguments: Any) -> Any:
-    """The element type of those arguments that are vectors; None if they differ or a scalar does not fit."""
-    found = {argument.element for argument in arguments if isinstance(argument, LanesType)}
-    others = [argument for argument in arguments if not isinstance(argument, LanesType)]
-    if len(found) != 1 or not all(isinstance(argument, types.Number) for argument in others):
+def _common_element(*arguments: Any) -> Any:
+    """The element type of the vectors among the arguments; None if they differ or a scalar does not fit it."""
+    elements = {argument.element for argument in arguments if isinstance(argument, LanesType)}
+    scalars = [argument for argument in arguments if not isinstance(argument, LanesType)]
+    if len(elements) != 1 or not all(isinstance(scalar, types.Number) for scalar in scalars):
         return None
-    if isinstance(next(iter(found)), types.Integer) and any(isinstance(argument, types.Float) for argument in others):
-        return None  # it would be cut off
-    return found.pop()
+    if isinstance(next(iter(elements)), types.Integer) and any(isinstance(scalar, types.Float) for scalar in scalars):
+        return None  # a cast would truncate the scalar
+    return elements.pop()
 
 
 def _binary(operation: Any, emit: Callable[[Any, bool, Any, Any], Any], compares: bool) -> None:
-    """Defines a binary operator on vectors; `emit(builder, is_float, a, b)` writes its instruction."""
+    """Defines a binary operator on vectors. `emit(builder, is_float, a, b)` emits its LLVM instruction."""
 
     @type_callable(operation)
     def typed(context: Any) -> Any:
         def typer(a: Any, b: Any) -> Any:
-            element = _element(a, b)
+            element = _common_element(a, b)
             if element is None:
                 return None
             return MASK if compares else LanesType(element)
@@ -82,8 +83,8 @@ def _binary(operation: Any, emit: Callable[[Any, bool, Any, Any], Any], compares
         return typer
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        element = _element(*sig.args)
-        a, b = (_as_lanes(context, builder, v, t, element) for v, t in zip(args, sig.args, strict=True))
+        element = _common_element(*sig.args)
+        a, b = (_broadcast(context, builder, v, t, element) for v, t in zip(args, sig.args, strict=True))
         return emit(builder, isinstance(element, types.Float), a, b)
 
     for left, right in ((LanesType, LanesType), (LanesType, types.Number), (types.Number, LanesType)):
@@ -124,70 +125,71 @@ def _unary(operation: Any, emit: Callable[[Any, Any], Any]) -> None:
         return emit(builder, args[0])
 
 
-def _llvm_function(builder: Any, name: str, vector: Any) -> Any:
-    letter = {"float": "f32", "double": "f64"}[str(vector.type.element)]
-    kind = ir.FunctionType(vector.type, [vector.type])
-    return cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}{letter}")
+def _llvm_intrinsic(builder: Any, name: str, vector: Any) -> Any:
+    """The LLVM intrinsic `name` for vectors of the type of `vector`."""
+    suffix = {"float": "f32", "double": "f64"}[str(vector.type.element)]
+    function_type = ir.FunctionType(vector.type, [vector.type])
+    return cgutils.get_or_insert_function(builder.module, function_type, f"llvm.{name}.v{LANES}{suffix}")
 
 
 _unary(operator.neg, lambda builder, a: builder.fneg(a))
 _unary(operator.invert, lambda builder, a: builder.not_(a))
-_unary(abs, lambda builder, a: builder.call(_llvm_function(builder, "fabs", a), [a]))
+_unary(abs, lambda builder, a: builder.call(_llvm_intrinsic(builder, "fabs", a), [a]))
 
 
 @intrinsic
-def root(typingctx: Any, a: Any) -> Any:
-    """Square root of every lane (correctly rounded; NaN below zero)."""
+def sqrt(typingctx: Any, a: Any) -> Any:
+    """The square root of every lane, correctly rounded; NaN for negative numbers."""
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.call(_llvm_function(builder, "sqrt", args[0]), args)
+        return builder.call(_llvm_intrinsic(builder, "sqrt", args[0]), args)
 
     return a(a), lower
 
 
 @intrinsic
 def splat(typingctx: Any, value: Any) -> Any:
-    """A vector of eight times `value`; whole numbers become int32."""
+    """A vector with `value` in every lane; integers become int32."""
     element = types.int32 if isinstance(value, types.Integer) else types.unliteral(value)
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _as_lanes(context, builder, args[0], sig.args[0], element)
+        return _broadcast(context, builder, args[0], sig.args[0], element)
 
     return LanesType(element)(value), lower
 
 
 @intrinsic
 def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
-    """Per lane, a where `mask` is set, else b; one of them may be a scalar."""
-    element = _element(a, b)
+    """Per lane, a where `mask` is set, else b. One of a and b may be a scalar. Both are always computed."""
+    element = _common_element(a, b)
     result = LanesType(element)
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pair = (_as_lanes(context, builder, v, t, element) for v, t in zip(args[1:], sig.args[1:], strict=True))
+        pair = (_broadcast(context, builder, v, t, element) for v, t in zip(args[1:], sig.args[1:], strict=True))
         return builder.select(args[0], *pair)
 
     return result(mask, a, b), lower
 
 
-def _smaller(builder: Any, symbol: str, a: Any, b: Any) -> Any:
+def _select_ordered(builder: Any, symbol: str, a: Any, b: Any) -> Any:
     return builder.select(builder.fcmp_ordered(symbol, a, b), a, b)
 
 
 @intrinsic
 def minimum(typingctx: Any, a: Any, b: Any) -> Any:
-    """Per lane, a if a < b, else b (so b where either is NaN)."""
-    return a(a, b), lambda context, builder, sig, args: _smaller(builder, "<", *args)
+    """Per lane, a if a < b, else b; so b where either is NaN."""
+    return a(a, b), lambda context, builder, sig, args: _select_ordered(builder, "<", *args)
 
 
 @intrinsic
 def maximum(typingctx: Any, a: Any, b: Any) -> Any:
-    """Per lane, a if a > b, else b (so b where either is NaN)."""
-    return a(a, b), lambda context, builder, sig, args: _smaller(builder, ">", *args)
+    """Per lane, a if a > b, else b; so b where either is NaN."""
+    return a(a, b), lambda context, builder, sig, args: _select_ordered(builder, ">", *args)
 
 
 @intrinsic
-def lane(typingctx: Any, vector: Any, i: Any) -> Any:
-    """The number in lane i."""
+def extract_lane(typingctx: Any, vector: Any, i: Any) -> Any:
+    """The number in lane i of a vector."""
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.extract_element(args[0], context.cast(builder, args[1], sig.args[1], types.int32))
@@ -197,7 +199,7 @@ def lane(typingctx: Any, vector: Any, i: Any) -> Any:
 
 @intrinsic
 def any_lane(typingctx: Any, mask: Any) -> Any:
-    """Whether the mask is set in any lane."""
+    """Whether a mask is set in any lane."""
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         bits = builder.bitcast(args[0], ir.IntType(LANES))
@@ -207,12 +209,13 @@ def any_lane(typingctx: Any, mask: Any) -> Any:
 
 
 def _pointer(context: Any, builder: Any, array: Any, value: Any, index: Any) -> Any:
-    """Address of element `index` of an array seen flat."""
+    """The address of element `index` of the flattened array."""
     data = context.make_array(array)(context, builder, value).data
     return builder.gep(data, [index], inbounds=True)
 
 
 def _vector_pointer(context: Any, builder: Any, array: Any, value: Any, element_index: Any, lanes: int) -> Any:
+    """(pointer to a vector of `lanes` elements that begins at `element_index`, its alignment in bytes)."""
     pointer = _pointer(context, builder, array, value, element_index)
     item = context.get_data_type(array.dtype)
     return builder.bitcast(pointer, ir.VectorType(item, lanes).as_pointer()), array.dtype.bitwidth // 8
@@ -225,8 +228,8 @@ def load(typingctx: Any, array: Any, i: Any) -> Any:
         return None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        at = builder.mul(context.cast(builder, args[1], sig.args[1], types.intp), ir.Constant(ir.IntType(64), LANES))
-        pointer, align = _vector_pointer(context, builder, sig.args[0], args[0], at, LANES)
+        start = builder.mul(context.cast(builder, args[1], sig.args[1], types.intp), ir.Constant(ir.IntType(64), LANES))
+        pointer, align = _vector_pointer(context, builder, sig.args[0], args[0], start, LANES)
         return builder.load(pointer, align=align)
 
     return LanesType(array.dtype)(array, i), lower
@@ -234,13 +237,13 @@ def load(typingctx: Any, array: Any, i: Any) -> Any:
 
 @intrinsic
 def store(typingctx: Any, array: Any, i: Any, value: Any) -> Any:
-    """Writes vector i of a C-contiguous array."""
+    """Writes `value` to vector i of a C-contiguous array."""
     if array.layout != "C":
         return None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        at = builder.mul(context.cast(builder, args[1], sig.args[1], types.intp), ir.Constant(ir.IntType(64), LANES))
-        pointer, align = _vector_pointer(context, builder, sig.args[0], args[0], at, LANES)
+        start = builder.mul(context.cast(builder, args[1], sig.args[1], types.intp), ir.Constant(ir.IntType(64), LANES))
+        pointer, align = _vector_pointer(context, builder, sig.args[0], args[0], start, LANES)
         builder.store(args[2], pointer, align=align)
         return context.get_dummy_value()
 
@@ -248,13 +251,14 @@ def store(typingctx: Any, array: Any, i: Any, value: Any) -> Any:
 
 
 def _lane_indices(builder: Any, vector: Any) -> list[Any]:
+    """The int32 indices in the lanes of `vector`, as eight scalars of 64 bits."""
     lanes = (builder.extract_element(vector, ir.Constant(ir.IntType(32), i)) for i in range(LANES))
     return [builder.sext(lane, ir.IntType(64)) for lane in lanes]
 
 
 @intrinsic
 def gather(typingctx: Any, array: Any, indices: Any) -> Any:
-    """Per lane, the element of an array seen flat at that lane's index (int32)."""
+    """Per lane, the element of the flattened array at that lane's index (int32)."""
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         item = context.get_data_type(sig.args[0].dtype)
@@ -269,7 +273,10 @@ def gather(typingctx: Any, array: Any, indices: Any) -> Any:
 
 @intrinsic
 def scatter(typingctx: Any, array: Any, indices: Any, value: Any) -> Any:
-    """Per lane, writes the element of an array seen flat at that lane's index (int32)."""
+    """Per lane, writes the element of the flattened array at that lane's index (int32).
+
+    Where lanes share an index, the last lane's value stays.
+    """
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         for i, index in enumerate(_lane_indices(builder, args[1])):
@@ -286,18 +293,19 @@ def _shuffle(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
 
 @intrinsic
 def gather_4(typingctx: Any, array: Any, indices: Any) -> Any:
-    """Per lane, the four columns of that lane's row of an array `[..., 4]`: four vectors.
+    """Per lane, the four columns of row `indices` (int32) of an array `[..., 4]`: four vectors, one per column.
 
-    Eight loads of a row and a transposition, some three times faster than four gathers.
+    Eight loads of a row and a transpose of 8 x 4 (array of structures to structure of arrays). That is about three
+    times faster than four gathers.
     """
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         rows = []
         for index in _lane_indices(builder, args[1]):
-            at = builder.mul(index, ir.Constant(ir.IntType(64), 4))
-            pointer, align = _vector_pointer(context, builder, sig.args[0], args[0], at, 4)
+            start = builder.mul(index, ir.Constant(ir.IntType(64), 4))
+            pointer, align = _vector_pointer(context, builder, sig.args[0], args[0], start, 4)
             rows.append(builder.load(pointer, align=align))
-        # rows i and i + 4 side by side, so that every later shuffle stays within half a register
+        # Rows i and i + 4 share a vector, so that every later shuffle stays within a 128-bit half of the register.
         wide = [_shuffle(builder, rows[i], rows[i + 4], list(range(8))) for i in range(4)]
         low = [0, 8, 1, 9, 4, 12, 5, 13]
         high = [2, 10, 3, 11, 6, 14, 7, 15]

@@ -1,4 +1,4 @@
-"""Constants of a kernel as one numpy record, which crosses from Python into a kernel forty times faster."""
+"""A kernel's constants as one numpy record, which numba unboxes forty times faster than a named tuple."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 
 def _dtype(value: Any) -> Any:
     if hasattr(value, "_fields"):
-        return np.dtype([(name, _dtype(part)) for name, part in zip(value._fields, value, strict=True)])
+        return np.dtype([(name, _dtype(field)) for name, field in zip(value._fields, value, strict=True)])
     array = np.asarray(value)
     return np.dtype((array.dtype, array.shape)) if array.shape else array.dtype
 
 
 def _values(value: Any) -> Any:
-    return tuple(_values(part) for part in value) if hasattr(value, "_fields") else value
+    return tuple(_values(field) for field in value) if hasattr(value, "_fields") else value
 
 
 def packed(params: Any) -> NDArray[Any]:
-    """A named tuple of numbers, arrays and such tuples as an array `[1]` of one record with the same names.
+    """Packs a named tuple into a structured array `[1]` with the same field names.
 
-    A kernel takes the array and reads its only element.
+    Fields may be numbers, arrays and named tuples of these. A kernel takes the array and reads its only element.
     """
     return np.array([_values(params)], _dtype(params))

@@ -1,4 +1,4 @@
-"""How separated the groups are (Eq. 3.1) and how near their goals (Eq. 3.2)."""
+"""Segregation of the groups (Eq. 3.1) and their distance to their goals (Eq. 3.2)."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from numpy.typing import NDArray
 
 
 def mean_pairwise_distances_m(pos: NDArray[np.floating], groups: int, count_self: bool = True) -> NDArray[np.float64]:
-    """Mean distance d_XY between the robots of every two groups (Eq. 3.1).
+    """Mean pairwise distance d_XY between every two groups (Eq. 3.1).
 
     Args:
-      pos: `[..., num_robots, 2]`, metres; groups are equal contiguous blocks of robots.
+      pos: `[..., num_robots, 2]`, metres; groups are contiguous blocks of equal size.
       groups: number of groups.
-      count_self: whether d_XX counts each robot's zero distance to itself, as printed, or only i != j (nan for
-        groups of one robot).
+      count_self: whether d_XX includes each robot's zero distance to itself, as Eq. 3.1 is printed, or only pairs
+        i != j (then NaN for groups of one robot).
 
     Returns:
-      `[..., groups, groups]` float64, metres; d_XX on the diagonal. As printed, 2 d_XY - d_XX - d_YY is never
-      negative (it is the energy distance of the two groups), so that groups of equal spread count as segregated
-      even when mixed.
+      `[..., groups, groups]` float64, metres, with d_XX on the diagonal. As printed, 2 d_XY - d_XX - d_YY is the
+      energy distance of the two groups and never negative. Groups of equal spread therefore count as segregated even
+      when they are mixed.
     """
     points = np.asarray(pos, np.float64)
     delta = points[..., :, None, :] - points[..., None, :, :]
@@ -33,31 +33,31 @@ def mean_pairwise_distances_m(pos: NDArray[np.floating], groups: int, count_self
 
 
 def segregated_fraction(pos: NDArray[np.floating], groups: int, count_self: bool = True) -> NDArray[np.float64]:
-    """Share of group pairs X != Y with d_XX < d_XY and d_YY < d_XY; 1 where there is one group.
+    """Fraction of the pairs of groups X != Y that are segregated: d_XX < d_XY and d_YY < d_XY (Section 3.1).
 
     Args:
       pos: `[..., num_robots, 2]`, metres.
       groups: number of groups.
-      count_self: see `mean_pairwise_distances_m`; without it mixed groups of equal spread are not segregated.
+      count_self: see `mean_pairwise_distances_m`. If false, mixed groups of equal spread are not segregated.
 
     Returns:
-      `[...]` float64 in [0, 1]; 1 means that all groups are segregated.
+      `[...]` float64 in [0, 1]; 1 if all groups are segregated or there is only one.
     """
     mean = mean_pairwise_distances_m(pos, groups, count_self)
     if groups == 1:
         return np.ones(mean.shape[:-2])
     own = np.diagonal(mean, axis1=-2, axis2=-1)
-    apart = (own[..., :, None] < mean) & (own[..., None, :] < mean)
+    segregated = (own[..., :, None] < mean) & (own[..., None, :] < mean)
     first, second = np.triu_indices(groups, 1)
-    share: NDArray[np.float64] = apart[..., first, second].mean(-1)
-    return share
+    fraction: NDArray[np.float64] = segregated[..., first, second].mean(-1)
+    return fraction
 
 
 def mean_goal_distance_m(pos: NDArray[np.floating], goal: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Mean distance of each group to its goal (Eq. 3.2).
+    """Mean distance of each group's robots to the group's goal (Eq. 3.2).
 
     Args:
-      pos: `[..., num_robots, 2]`, metres.
+      pos: `[..., num_robots, 2]`, metres; groups are contiguous blocks of equal size.
       goal: `[..., groups, 2]`, metres.
 
     Returns:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_core.jit import inlined, product
+from sim_core.jit import inlined, inlined_blas
 
 Floats = NDArray[np.float32]
 
@@ -25,13 +25,13 @@ def make_room(count: int, layers: Layers) -> tuple[Floats, ...]:
     return tuple(np.zeros((count, width), np.float32) for width in widths)
 
 
-@product
+@inlined_blas
 def multiply(a: Floats, b: Floats, out: Floats) -> None:
     """The matrix product a b, written to `out`."""
     np.dot(a, b, out)
 
 
-@product
+@inlined_blas
 def squared_norm(x: Floats) -> Any:
     """The scalar product of x with itself."""
     return np.dot(x, x)

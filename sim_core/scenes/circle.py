@@ -1,8 +1,8 @@
-"""The dissertation's scene: segregated groups on a circle, goals antipodal (3.1).
+"""The dissertation's scene: segregated groups on a circle with antipodal goals (Section 3.1).
 
-Group centres lie evenly on a circle, the whole scene turned by a random angle. Each group is a square grid with jitter;
-its goal is the point opposite its centre. One robot of all is drawn as the learning robot. Everything is drawn from
-the world's own random stream.
+Group centres lie evenly on a circle, which is rotated by a random angle. Each group starts on a square grid with
+jitter, and its goal is the point of the circle opposite its centre. The learning robot is drawn from all robots. All
+draws come from the world's own random stream.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from sim_core.state import WorldState
 
 
 class CircleParams(NamedTuple):
-    """Constants of the scene (float64; positions are rounded when stored)."""
+    """Constants of the scene, in float64; positions are rounded when they are stored."""
 
     robots: int
     groups: int
@@ -40,12 +40,12 @@ def circle_params(config: WorldConfig) -> CircleParams:
 
 @kernel
 def start_world(world, state, s):
-    """Writes a fresh start of one world. `s`: CircleParams."""
-    turn = 2.0 * math.pi * uniform(state.rng, world)
+    """Writes start positions, zero velocities, goals and the learning robot of one world. `s`: CircleParams."""
+    rotation = 2.0 * math.pi * uniform(state.rng, world)
     columns = math.ceil(math.sqrt(s.robots))
     rows = math.ceil(s.robots / columns)
     for group in range(s.groups):
-        angle = turn + 2.0 * math.pi * group / s.groups
+        angle = rotation + 2.0 * math.pi * group / s.groups
         cos, sin = math.cos(angle), math.sin(angle)
         state.goal_x[world, group] = -s.arena_radius_m * cos
         state.goal_y[world, group] = -s.arena_radius_m * sin

@@ -1,1 +1,1 @@
-"""The swarm: start positions, neighbour search, flocking, one step of every world."""
+"""The swarm: start positions, neighbour search, flocking, and the step of all worlds."""

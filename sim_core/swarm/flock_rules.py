@@ -1,8 +1,7 @@
-"""FL-ORCA's states, weights and constants; the kernels that use them are in `sim_core.swarm.flocking`.
+"""FL-ORCA's states, weights and constants. The kernels that use them are in `sim_core.swarm.flocking`.
 
-The dissertation names terms and states but no weights: `published` takes those that the authors' lab has
-published since, `uniform` one weight per term in all states. A robot cannot see another group, have a
-blocked view and stand in none of the published rows, so the rows are complete.
+The dissertation names the states and terms (Algorithm 3, Figure 2.2) but no weights. The rules `published` take the
+weights that the authors' lab has published since. The rules `uniform` take one weight per term in all states.
 """
 
 from __future__ import annotations
@@ -15,17 +14,21 @@ import numpy as np
 from sim_core.config import WorldConfig
 
 SINGLE_GROUP, VISION_FREE, FOLLOWER, TURN_RIGHT = 0, 1, 2, 3
+"""States of the state machine (Figure 2.2)."""
 STATE_NAMES = ("single group", "vision free", "follower", "turn right")
 
-SEES, FREE, FOLLOWS_FREE, FOLLOWS_FOLLOWER = 1, 2, 4, 8
-"""Bits of a robot's flags: sees another group, free view, level-1 follower, level-2 follower."""
+SEES_OTHER_GROUP, VIEW_FREE, FOLLOWER_LEVEL_1, FOLLOWER_LEVEL_2 = 1, 2, 4, 8
+"""Bits of a robot's flags. A level-1 follower follows a robot with a free view, a level-2 follower a level-1 one."""
 
 NO_FLOCK, PUBLISHED, UNIFORM = range(3)
-"""Rule sets: straight to the goal, the published table, one weight a term."""
+"""Rule sets: no flocking, straight to the goal; the published weights; one weight per term."""
 
 COHESION, SEPARATION, ALIGNMENT, PREFERRED, LEADER, RIGHT = range(6)
+"""Terms of the weighted sum."""
 PUBLISHED_WEIGHTS = {
-    # (state, sees another group): cohesion, separation, alignment, preferred, leader, right
+    # (state, sees another group): cohesion, separation, alignment, preferred, leader, right.
+    # The rows are complete: Vision Free needs another group in sight, and a robot that sees another group and whose
+    # view is not free follows or turns right.
     (SINGLE_GROUP, False): (1.0, 0.0, 1.0, 1.0, 0.0, 0.0),
     (VISION_FREE, True): (15.0, 0.5, 5.0, 0.35, 0.0, 0.0),
     (FOLLOWER, False): (10.0, 0.0, 0.0, 1.0, 50.0, 0.0),
@@ -36,7 +39,7 @@ PUBLISHED_WEIGHTS = {
 
 
 class FlockParams(NamedTuple):
-    """The flock's constants in the worlds' dtype; weights `[state, sees, term]`, two unused terms last."""
+    """Flocking constants in the worlds' dtype; weights `[4, 2, 8]` as of `flock_weights`."""
 
     rules: int
     weights: Any
@@ -56,7 +59,7 @@ class FlockParams(NamedTuple):
 
 
 def flock_weights(config: WorldConfig, dtype: Any) -> np.ndarray:
-    """Weights `[4, 2, 8]` (state, sees another group, term, two unused) of `config.flocking`."""
+    """Weights `[state, sees another group, term]` of `config.flocking`: `[4, 2, 8]`, the last two terms unused."""
     weights = np.zeros((4, 2, 8), dtype)
     if config.flocking == "published":
         for (state, sees), row in PUBLISHED_WEIGHTS.items():
@@ -71,7 +74,7 @@ def flock_weights(config: WorldConfig, dtype: Any) -> np.ndarray:
 
 
 def flock_params(config: WorldConfig, dtype: Any) -> FlockParams:
-    """The flock's constants of `config`, each a scalar of `dtype`."""
+    """The flocking constants of `config`; reals are scalars of `dtype`."""
     real = np.dtype(dtype).type
 
     def cosine(angle_deg: float) -> Any:

@@ -1,8 +1,11 @@
-"""A tile: the robots of a few worlds side by side, so that vectors of eight are full, and their work space.
+"""Tiles: the work space in which a few worlds take their step.
 
-Worlds of 10 robots would leave 6 of 16 lanes idle; four of them are five full vectors. A tile holds as many
-worlds as it takes (one, where their size is a multiple of eight), small enough to stay in the cache over all
-passes of a step. A slot is a robot's place in the tile; a row is a vector of eight slots.
+The worlds of a batch are processed in tiles (loop tiling). The robots of a tile's worlds stand side by side, so that
+vectors of eight are full: a world of 10 robots would leave 6 of 16 lanes idle, four such worlds fill five vectors. A
+tile holds the fewest worlds that fill its vectors (one if their size is a multiple of eight), and is small enough to
+stay in the processor's cache over all passes of a step.
+
+A slot is a robot's index in the tile. A row is a vector of eight slots, which the passes process together.
 """
 
 from __future__ import annotations
@@ -18,41 +21,44 @@ from sim_core.swarm.grid import Grid, empty_grid
 
 
 class Tile(NamedTuple):
-    """Work space of a tile. The last slot is nobody's: NaN, so that every comparison with it is false.
+    """Work space of a tile; `k` is `max_neighbours`, reals are of the worlds' dtype.
 
-    body: `[slots, 4]` position (metres) and velocity (m/s) in the old state.
-    aim: `[slots, 4]` vector to the goal (metres), its squared length, 0.
+    The last slot is padding. Its position is NaN, so that every comparison with it is false.
+
+    pos_vel: `[slots, 4]`, position (metres) and velocity (m/s) in the old state.
+    to_goal: `[slots, 4]`, vector to the goal (metres), its squared length, 0.
     group: `[slots]` int32.
-    reach_sq: `[tiles, slots]`, by grid: radius within which the search for neighbours begins, squared.
-    seen_x, seen_y: `[slots]`, positions of candidates in search order; NaN where nobody may see it.
-    seen_slot: `[slots]` int32, their slots.
-    order: `[rows, 8]` int32, slots of the rows' lanes.
-    neighbours: `[tiles, rows, max_neighbours, 8]` int32 slots, nearest first, -1 for none; by grid, one tile's.
-    mates: `[rows, max_neighbours, 8]`, the same, the robot itself in the place of one of another group or none.
-    counts: `[rows]` int32, entries of the row's longest list.
-    distances: `[max_neighbours, 8]`, squared metres.
-    terms: `[rows, 6, 8]`, cohesion, separation and alignment.
-    flags, leaders: `[slots]` int32.
-    lines, projected: `[max_neighbours, 4, 8]`.
+    search_radius_sq: `[tiles, slots]`, squared radius in which the grid's search for neighbours begins.
+    candidate_x, candidate_y: `[slots]`, positions of the candidates, in search order; x is NaN for a hidden robot.
+    candidate_slot: `[slots]` int32, the candidates' slots.
+    row_slots: `[rows, 8]` int32, the slots in each row's lanes.
+    neighbours: `[tiles, rows, k, 8]` int32 slots, nearest first, -1 for none; with a grid, one tile's.
+    flockmates: `[rows, k, 8]` int32, the neighbours of the robot's own group; elsewhere the robot itself.
+    neighbour_counts: `[rows]` int32, entries of the longest neighbour list of the row.
+    distances_sq: `[k, 8]`, squared metres.
+    flock_terms: `[rows, 6, 8]`, x and y of cohesion, separation and alignment.
+    flags: `[slots]` int32, bits of `flock_rules`.
+    leaders: `[slots]` int32, the slot of the robot that is followed, -1 for none.
+    lines, projected: `[k, 4, 8]`, scratch of the linear programs.
     new_vx, new_vy: `[slots]`, m/s.
-    machine: `[slots]` int32.
-    noise: `[8]`.
+    machine: `[slots]` int32, the state of FL-ORCA's state machine.
+    noise: `[8]`, one draw per lane.
     grid: Grid, used in large worlds.
     """
 
-    body: Any
-    aim: Any
+    pos_vel: Any
+    to_goal: Any
     group: Any
-    reach_sq: Any
-    seen_x: Any
-    seen_y: Any
-    seen_slot: Any
-    order: Any
+    search_radius_sq: Any
+    candidate_x: Any
+    candidate_y: Any
+    candidate_slot: Any
+    row_slots: Any
     neighbours: Any
-    mates: Any
-    counts: Any
-    distances: Any
-    terms: Any
+    flockmates: Any
+    neighbour_counts: Any
+    distances_sq: Any
+    flock_terms: Any
     flags: Any
     leaders: Any
     lines: Any
@@ -65,56 +71,65 @@ class Tile(NamedTuple):
 
 
 GRID_FROM_ROBOTS = 300
-"""Worlds with at least as many robots are searched by grid; smaller ones robot by robot, which is faster there."""
+"""Worlds with at least as many robots use the grid to find neighbours; smaller ones test all pairs, which is faster."""
 
 
 def worlds_per_tile(num_robots: int) -> int:
-    """Fewest worlds of `num_robots` that fill vectors of eight; one if they are searched by grid."""
+    """The fewest worlds of `num_robots` that fill vectors of eight; one if they use the grid."""
     return 1 if num_robots >= GRID_FROM_ROBOTS else LANES // math.gcd(num_robots, LANES)
 
 
 def world_tile(config: WorldConfig, num_worlds: int, dtype: Any) -> Tile:
-    """Work space for a batch of `num_worlds` worlds of `config`."""
-    size = config.num_robots
-    if size >= GRID_FROM_ROBOTS:  # a row may be cut after any robot
-        return empty_tile(size, size, config.max_neighbours, dtype, num_tiles=num_worlds, grid=True)
-    worlds = min(worlds_per_tile(size), num_worlds)
-    rows = -(-worlds * size // LANES)
+    """The work space for a batch of `num_worlds` worlds of `config`."""
+    num_robots = config.num_robots
+    if num_robots >= GRID_FROM_ROBOTS:  # in the worst case every row ends after one robot
+        return empty_tile(num_robots, num_robots, config.max_neighbours, dtype, num_tiles=num_worlds, use_grid=True)
+    worlds = min(worlds_per_tile(num_robots), num_worlds)
+    rows = -(-worlds * num_robots // LANES)
     return empty_tile(rows * LANES, rows, config.max_neighbours, dtype, num_tiles=-(-num_worlds // worlds))
 
 
 def empty_tile(
-    num_slots: int, num_rows: int, max_neighbours: int, dtype: Any, *, num_tiles: int = 1, grid: bool = False
+    num_slots: int, num_rows: int, max_neighbours: int, dtype: Any, *, num_tiles: int = 1, use_grid: bool = False
 ) -> Tile:
-    """Work space for `num_slots` robots in `num_rows` rows, and what it remembers of `num_tiles` tiles."""
+    """The work space for `num_slots` robots in `num_rows` rows.
+
+    Args:
+      num_slots: robots of a tile, without the padding slot.
+      num_rows: rows of a tile.
+      max_neighbours: length of a neighbour list.
+      dtype: of the real numbers.
+      num_tiles: tiles of the batch; each has its own neighbour lists or search radii, which the next step reuses.
+      use_grid: whether neighbours are found with the grid.
+    """
     slots, k = num_slots + 1, max_neighbours
 
-    def whole(*shape: int) -> Any:
+    def int32_zeros(*shape: int) -> Any:
         return np.zeros(shape, np.int32)
 
     tile = Tile(
-        body=np.full((slots, 4), np.nan, dtype),
-        aim=np.full((slots, 4), np.nan, dtype),
-        group=whole(slots),
-        reach_sq=np.zeros((num_tiles, slots), dtype),
-        seen_x=np.zeros(slots, dtype),
-        seen_y=np.zeros(slots, dtype),
-        seen_slot=np.arange(slots, dtype=np.int32),
-        order=np.arange(num_rows * LANES, dtype=np.int32).reshape(num_rows, LANES),
-        neighbours=np.full((1 if grid else num_tiles, num_rows, k, LANES), -1, np.int32),
-        mates=whole(num_rows, k, LANES),
-        counts=whole(num_rows),
-        distances=np.zeros((k, LANES), dtype),
-        terms=np.zeros((num_rows, 6, LANES), dtype),
-        flags=whole(slots),
-        leaders=whole(slots),
+        pos_vel=np.full((slots, 4), np.nan, dtype),
+        to_goal=np.full((slots, 4), np.nan, dtype),
+        group=int32_zeros(slots),
+        search_radius_sq=np.zeros((num_tiles, slots), dtype),
+        candidate_x=np.zeros(slots, dtype),
+        candidate_y=np.zeros(slots, dtype),
+        candidate_slot=np.arange(slots, dtype=np.int32),
+        row_slots=np.arange(num_rows * LANES, dtype=np.int32).reshape(num_rows, LANES),
+        neighbours=np.full((1 if use_grid else num_tiles, num_rows, k, LANES), -1, np.int32),
+        flockmates=int32_zeros(num_rows, k, LANES),
+        neighbour_counts=int32_zeros(num_rows),
+        distances_sq=np.zeros((k, LANES), dtype),
+        flock_terms=np.zeros((num_rows, 6, LANES), dtype),
+        flags=int32_zeros(slots),
+        leaders=int32_zeros(slots),
         lines=np.zeros((k, 4, LANES), dtype),
         projected=np.zeros((k, 4, LANES), dtype),
         new_vx=np.zeros(slots, dtype),
         new_vy=np.zeros(slots, dtype),
-        machine=whole(slots),
+        machine=int32_zeros(slots),
         noise=np.zeros(LANES, dtype),
         grid=empty_grid(num_slots),
     )
-    np.minimum(tile.order, num_slots, out=tile.order)
+    np.minimum(tile.row_slots, num_slots, out=tile.row_slots)
     return tile

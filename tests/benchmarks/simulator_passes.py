@@ -1,6 +1,6 @@
-"""Where the time of a step goes: the processor's cycle counter read between the passes of real episodes.
+"""Where the time of a step goes: the processor's cycle counter is read between the passes of real episodes.
 
-`_timed_advance` is `sim_core.swarm.step.advance` with a watch; the calls, and so the work, are the same.
+`_timed_advance` is `sim_core.swarm.step.advance` with a timer around each pass. It makes the same calls.
 """
 
 import time
@@ -19,7 +19,7 @@ from sim_core.lanes import load, scatter
 from sim_core.orca import build_half_planes, orca_velocity
 from sim_core.swarm import step
 from sim_core.swarm.flocking import preferred_velocity
-from sim_core.swarm.neighbours import find_neighbours, lists_of
+from sim_core.swarm.neighbours import find_neighbours, list_start
 from sim_core.worlds import WorldBatch
 
 SETUPS = ((5, 2), (10, 4), (25, 8))
@@ -50,25 +50,26 @@ def _cycles(typingctx: Any) -> Any:
 def _timed_advance(state, tile, command, spent, params):
     p = params[0]
     num_worlds, size = state.pos_x.shape
-    for first in range(0, num_worlds, p.tile_worlds):
-        worlds, index = min(p.tile_worlds, num_worlds - first), first // p.tile_worlds
+    for first in range(0, num_worlds, p.worlds_per_tile):
+        worlds, index = min(p.worlds_per_tile, num_worlds - first), first // p.worlds_per_tile
         t = _cycles()
         rows = step.load_tile(first, worlds, state, tile, p)
         spent[0] += _cycles() - t
         t = _cycles()
         for row in range(rows):
-            find_neighbours(row, index, size, worlds * size, tile, p.near)
+            find_neighbours(row, index, size, worlds * size, tile, p.neighbours)
         spent[1] += _cycles() - t
         t = _cycles()
-        step.find_flock_terms(index, rows, tile, state.rng, p)
+        step.run_flocking_passes(index, rows, tile, state.rng, p)
         spent[2] += _cycles() - t
         for row in range(rows):
             t = _cycles()
-            robot, count, at = load(tile.order, row), tile.counts[row], lists_of(row, index, tile, p.near)
+            robot, count = load(tile.row_slots, row), tile.neighbour_counts[row]
+            start = list_start(row, index, tile, p.neighbours)
             pref_x, pref_y = preferred_velocity(row, tile, p.flock)
             spent[3] += _cycles() - t
             t = _cycles()
-            build_half_planes(robot, tile.body, tile.neighbours, at, count, tile.lines, p.orca)
+            build_half_planes(robot, tile.pos_vel, tile.neighbours, start, count, tile.lines, p.orca)
             spent[4] += _cycles() - t
             t = _cycles()
             x, y = orca_velocity(tile.lines, count, pref_x, pref_y, tile.projected, p.orca)

@@ -1,7 +1,6 @@
-"""Doors from the tests to the kernels, which work on vectors of eight that Python never sees.
+"""Wrappers through which tests call the kernels, whose vectors of eight Python cannot hold.
 
-A single problem goes into one lane; the other lanes hold decoys, so that a lane that looked at its
-neighbour's numbers would be found out.
+A single problem goes into one lane. The other lanes hold decoys, so that a kernel which mixes lanes fails.
 """
 
 from typing import NamedTuple
@@ -11,15 +10,15 @@ import numpy as np
 from sim_core.jit import kernel
 from sim_core.lanes import LANES, gather, load, scatter, splat, store
 from sim_core.orca import build_half_planes, linear_program_2, linear_program_3, orca_params, orca_velocity
-from sim_core.swarm.flocking import finish_separation, look, preferred_velocity, weighted_sum
-from sim_core.swarm.grid import CELLS_PER_RANGE, arrange
+from sim_core.swarm.flocking import finish_separation, preferred_velocity, sense_neighbours, weighted_sum
+from sim_core.swarm.grid import CELLS_PER_RANGE, build_cell_list
 from sim_core.swarm.neighbours import find_neighbours, neighbour_params
-from sim_core.swarm.step import find_flock_terms
+from sim_core.swarm.step import run_flocking_passes
 from sim_core.swarm.tile import empty_tile
 
 
 class OrcaStep(NamedTuple):
-    """ORCA's new velocities `[n, 2]`, and of each robot its half-planes `[count, 4]` and neighbours `[count]`."""
+    """ORCA's new velocities `[n, 2]`; of each robot its half-planes `[count, 4]` and neighbours `[count]`."""
 
     velocity: np.ndarray
     planes: list[np.ndarray]
@@ -27,50 +26,50 @@ class OrcaStep(NamedTuple):
 
 
 @kernel
-def _orca_rows(num_slots, rows, tile, pref_x, pref_y, planes, near, orca):
+def _orca_rows(num_slots, rows, tile, pref_x, pref_y, planes, search, orca):
     for row in range(rows):
-        find_neighbours(row, 0, num_slots, num_slots, tile, near)
+        find_neighbours(row, 0, num_slots, num_slots, tile, search)
     for row in range(rows):
-        robot, count = load(tile.order, row), tile.counts[row]
-        wish_x, wish_y = gather(pref_x, robot), gather(pref_y, robot)
-        build_half_planes(robot, tile.body, tile.neighbours, row * near.capacity, count, tile.lines, orca)
-        x, y = orca_velocity(tile.lines, count, wish_x, wish_y, tile.projected, orca)
+        robot, count = load(tile.row_slots, row), tile.neighbour_counts[row]
+        row_pref_x, row_pref_y = gather(pref_x, robot), gather(pref_y, robot)
+        build_half_planes(robot, tile.pos_vel, tile.neighbours, row * search.max_neighbours, count, tile.lines, orca)
+        x, y = orca_velocity(tile.lines, count, row_pref_x, row_pref_y, tile.projected, orca)
         scatter(tile.new_vx, robot, x)
         scatter(tile.new_vy, robot, y)
         for i in range(4 * count):
-            store(planes, 4 * near.capacity * row + i, load(tile.lines, i))
+            store(planes, 4 * search.max_neighbours * row + i, load(tile.lines, i))
 
 
 @kernel
-def _arrange(num_slots, tile, edge_m):
-    return arrange(num_slots, tile, edge_m)
+def _build_cell_list(num_slots, tile, cell_size_m):
+    return build_cell_list(num_slots, tile, cell_size_m)
 
 
-def arranged(pos, edge_m, real=np.float32):
-    """(tile, rows) of one world's robots, sorted into a grid of cells of `edge_m` or longer.
+def cell_list(pos, cell_size_m, real=np.float32):
+    """(tile, rows) of one world's robots, sorted into a grid with cells of `cell_size_m` or larger.
 
-    Whatever `arrange` has to write holds nonsense before.
+    All arrays that `build_cell_list` has to write hold invalid numbers before.
     """
     n = len(pos)
     tile = empty_tile(n, n, 1, real)
-    tile.body[:n, :2] = pos
-    for array in (tile.order, tile.seen_slot, *tile.grid):
+    tile.pos_vel[:n, :2] = pos
+    for array in (tile.row_slots, tile.candidate_slot, *tile.grid):
         array[:] = -99
-    return tile, _arrange(n, tile, float(edge_m))
+    return tile, _build_cell_list(n, tile, float(cell_size_m))
 
 
-def _world_tile(pos, vel, max_neighbours, reach_m, hidden, real, edge_m=None):
-    """(tile, rows) of one world's robots; searched by grid if `edge_m`, the edge of its cells, is given."""
+def _world_tile(pos, vel, max_neighbours, search_radius_m, hidden, real, cell_size_m=None):
+    """(tile, rows) of one world's robots; with a grid if `cell_size_m` is given."""
     n = len(pos)
     rows = -(-n // LANES)
-    tile = empty_tile(*((rows * LANES, rows) if edge_m is None else (n, n)), max_neighbours, real)
-    tile.body[:n, :2], tile.body[:n, 2:] = pos, vel
-    tile.seen_x[:n], tile.seen_y[:n] = np.transpose(pos)
-    tile.reach_sq[:] = real(reach_m) ** 2
-    if edge_m is not None:
-        rows = _arrange(n, tile, edge_m)
+    tile = empty_tile(*((rows * LANES, rows) if cell_size_m is None else (n, n)), max_neighbours, real)
+    tile.pos_vel[:n, :2], tile.pos_vel[:n, 2:] = pos, vel
+    tile.candidate_x[:n], tile.candidate_y[:n] = np.transpose(pos)
+    tile.search_radius_sq[:] = real(search_radius_m) ** 2
+    if cell_size_m is not None:
+        rows = _build_cell_list(n, tile, cell_size_m)
     if hidden >= 0:
-        tile.seen_x[hidden if edge_m is None else tile.grid.place[hidden]] = np.nan
+        tile.candidate_x[hidden if cell_size_m is None else tile.grid.rank[hidden]] = np.nan
     return tile, rows
 
 
@@ -87,35 +86,36 @@ def orca_step(
     range_m=1.5,
     max_neighbours=10,
     hidden=-1,
-    reach_m=None,
-    grid=False,
-    remembered=None,
+    search_radius_m=None,
+    use_grid=False,
+    last_lists=None,
 ):
-    """ORCA's step of one world's robots, computed in `real`.
+    """One step of ORCA for one world's robots, computed in `real`.
 
     Args:
       pos, vel, pref: `[n, 2]`, positions (m), velocities and preferred velocities (m/s).
       real: np.float32 or np.float64.
-      hidden: a robot that nobody perceives, or -1.
-      reach_m: where the search for neighbours begins, the whole range by default.
-      grid: whether neighbours are searched by grid, as in large worlds.
-      remembered: `[n, max_neighbours]`, the robots' lists of the step before, -1 for none; empty by default.
+      hidden: a robot that is nobody's neighbour, or -1.
+      search_radius_m: radius in which the grid's search begins, the whole range by default.
+      use_grid: whether neighbours are found with the grid, as in large worlds.
+      last_lists: `[n, max_neighbours]`, the robots' neighbour lists of the last step, -1 for none; empty by default.
     """
     pos, vel, pref = (np.asarray(array, real) for array in (pos, vel, pref))
     n = len(pos)
-    edge_m = range_m / CELLS_PER_RANGE if grid else None
-    tile, rows = _world_tile(pos, vel, max_neighbours, range_m if reach_m is None else reach_m, hidden, real, edge_m)
-    if remembered is not None:
+    cell_size_m = range_m / CELLS_PER_RANGE if use_grid else None
+    search_radius_m = range_m if search_radius_m is None else search_radius_m
+    tile, rows = _world_tile(pos, vel, max_neighbours, search_radius_m, hidden, real, cell_size_m)
+    if last_lists is not None:
         lists = np.full((rows * LANES, max_neighbours), -1)
-        lists[:n] = remembered
+        lists[:n] = last_lists
         tile.neighbours[0] = lists.reshape(rows, LANES, max_neighbours).transpose(0, 2, 1)
-    padded = np.zeros((2, len(tile.body)), real)
+    padded = np.zeros((2, len(tile.pos_vel)), real)
     padded[:, :n] = pref.T
     planes = np.zeros((rows, max_neighbours, 4, LANES), real)
-    near = neighbour_params(max_neighbours, range_m, 0.1, real, grid=grid)
+    search = neighbour_params(max_neighbours, range_m, 0.1, real, use_grid=use_grid)
     orca = orca_params(radius_m, horizon_s, time_step_s, max_speed_m_s, real)
-    _orca_rows(n, rows, tile, *padded, planes, near, orca)
-    lane_of = np.argsort(tile.order[:rows].ravel(), kind="stable")[:n]  # the robots, then nobody
+    _orca_rows(n, rows, tile, *padded, planes, search, orca)
+    lane_of = np.argsort(tile.row_slots[:rows].ravel(), kind="stable")[:n]  # the robots come before the padding
     neighbours = tile.neighbours[0, :rows].transpose(0, 2, 1).reshape(-1, max_neighbours)[lane_of]
     lines = planes.transpose(0, 3, 1, 2).reshape(-1, max_neighbours, 4)[lane_of]
     assert not lines[neighbours < 0].any()
@@ -133,49 +133,50 @@ def orca_velocities(pos, vel, pref, **settings):
 
 
 def _in_lane(problem, lane):
-    """`[..., 8]`: the problem in its lane, turned copies of it in the others."""
+    """`[..., 8]`: the problem in its lane, rotated copies of it in the others."""
     problem = np.asarray(problem, np.float64)
     points = problem.reshape(*problem.shape[:-1], -1, 2)
     angle = 0.7 * (np.arange(LANES) - lane)
     cos, sin = np.cos(angle), np.sin(angle)
     x, y = points[..., 0, None], points[..., 1, None]
-    turned = np.stack([x * cos - y * sin, x * sin + y * cos], axis=-2)
-    return np.ascontiguousarray(turned.reshape(*problem.shape, LANES))
+    rotated = np.stack([x * cos - y * sin, x * sin + y * cos], axis=-2)
+    return np.ascontiguousarray(rotated.reshape(*problem.shape, LANES))
 
 
 @kernel
-def _second_program(lines, opt, direction_opt, rows, found, p):
-    count = lines.shape[0]
-    row, x, y = linear_program_2(lines, count, load(opt, 0), load(opt, 1), splat(True), direction_opt, p)
-    store(rows, 0, row)
-    store(found, 0, x)
-    store(found, 1, y)
+def _second_program(lines, opt, direction_opt, failed, velocity, p):
+    num_lines = lines.shape[0]
+    line, x, y = linear_program_2(lines, num_lines, load(opt, 0), load(opt, 1), splat(True), direction_opt, p)
+    store(failed, 0, line)
+    store(velocity, 0, x)
+    store(velocity, 1, y)
 
 
 @kernel
-def _third_program(lines, rows, found, projected, p):
-    x, y = linear_program_3(lines, lines.shape[0], load(rows, 0), load(found, 0), load(found, 1), projected, p)
-    store(found, 0, x)
-    store(found, 1, y)
+def _third_program(lines, failed, velocity, projected, p):
+    line, x, y = load(failed, 0), load(velocity, 0), load(velocity, 1)
+    x, y = linear_program_3(lines, lines.shape[0], line, x, y, projected, p)
+    store(velocity, 0, x)
+    store(velocity, 1, y)
 
 
 def second_program(lines, opt, direction_opt, p, lane=3):
-    """(failed row, velocity `[2]`) of one problem with half-planes `[count, 4]`, float64."""
-    rows, found = np.zeros(LANES, np.int32), np.zeros((2, LANES))
-    _second_program(_in_lane(lines, lane), _in_lane(opt, lane), direction_opt, rows, found, p)
-    return int(rows[lane]), found[:, lane]
+    """(failed line, velocity `[2]`) of one problem with half-planes `[num_lines, 4]`, float64."""
+    failed, velocity = np.zeros(LANES, np.int32), np.zeros((2, LANES))
+    _second_program(_in_lane(lines, lane), _in_lane(opt, lane), direction_opt, failed, velocity, p)
+    return int(failed[lane]), velocity[:, lane]
 
 
-def third_program(lines, failed_row, velocity, p, lane=5):
-    """Velocity `[2]` of the third program after the second one stopped at `failed_row` with `velocity`."""
-    rows, found = np.full(LANES, failed_row, np.int32), _in_lane(velocity, lane)
+def third_program(lines, failed_line, velocity, p, lane=5):
+    """Velocity `[2]` of the third program after the second one failed at `failed_line` with `velocity`."""
+    failed, velocities = np.full(LANES, failed_line, np.int32), _in_lane(velocity, lane)
     planes = _in_lane(lines, lane)
-    _third_program(planes, rows, found, np.full_like(planes, np.nan), p)
-    return found[:, lane]
+    _third_program(planes, failed, velocities, np.full_like(planes, np.nan), p)
+    return velocities[:, lane]
 
 
 class Flock(NamedTuple):
-    """What FL-ORCA says about one world: preferred velocity `[num_robots, 2]` and a robot's notes."""
+    """FL-ORCA's results for one world: preferred velocities `[num_robots, 2]`; `[num_robots]` int32 the others."""
 
     velocity: np.ndarray
     states: np.ndarray
@@ -186,8 +187,8 @@ class Flock(NamedTuple):
 @kernel
 def _flock_rows(num_slots, rows, tile, rng, pref_x, pref_y, p):
     for row in range(rows):
-        find_neighbours(row, 0, num_slots, num_slots, tile, p.near)
-    find_flock_terms(0, rows, tile, rng, p)
+        find_neighbours(row, 0, num_slots, num_slots, tile, p.neighbours)
+    run_flocking_passes(0, rows, tile, rng, p)
     for row in range(rows):
         x, y = preferred_velocity(row, tile, p.flock)
         store(pref_x, row, x)
@@ -195,14 +196,16 @@ def _flock_rows(num_slots, rows, tile, rng, pref_x, pref_y, p):
 
 
 def flock_of(pos, vel, goals, seed, p, real=np.float32):
-    """Flock of one world; `p` are its SwarmParams."""
+    """The Flock of one world. `p`: its SwarmParams."""
     pos = np.asarray(pos, real)
     n = len(pos)
-    tile, rows = _world_tile(pos, np.zeros_like(pos) if vel is None else vel, p.near.capacity, 0, -1, real)
-    tile.reach_sq[:] = p.near.range_sq
+    vel = np.zeros_like(pos) if vel is None else vel
+    tile, rows = _world_tile(pos, vel, p.neighbours.max_neighbours, 0, -1, real)
+    tile.search_radius_sq[:] = p.neighbours.range_sq
     tile.group[:n] = np.arange(n) // (p.num_robots // p.groups)
-    tile.aim[:n, :2] = np.asarray(goals, real)[tile.group[:n]] - pos
-    tile.aim[:n, 2] = tile.aim[:n, 0] * tile.aim[:n, 0] + tile.aim[:n, 1] * tile.aim[:n, 1]
+    to_goal = tile.to_goal[:n]
+    to_goal[:, :2] = np.asarray(goals, real)[tile.group[:n]] - pos
+    to_goal[:, 2] = to_goal[:, 0] * to_goal[:, 0] + to_goal[:, 1] * to_goal[:, 1]
     pref = np.zeros((2, rows * LANES), real)
     _flock_rows(n, rows, tile, np.array([seed], np.uint64), *pref, p)
     return Flock(pref[:, :n].T.copy(), tile.machine[:n], tile.flags[:n], tile.leaders[:n])
@@ -210,23 +213,23 @@ def flock_of(pos, vel, goals, seed, p, real=np.float32):
 
 @kernel
 def _terms(tile, gain, f):
-    apart = look(0, 0, tile, f)
-    finish_separation(0, tile, apart, splat(gain), f)
+    num_separated = sense_neighbours(0, 0, tile, f)
+    finish_separation(0, tile, num_separated, splat(gain), f)
 
 
 def terms_of_robot_0(pos, vel, goal, gain, f, robots, real=np.float32):
-    """(cohesion, separation, alignment) `[3, 2]` of robot 0, all others being its neighbours."""
+    """(cohesion, separation, alignment) `[3, 2]` of robot 0; all others are its neighbours."""
     n = len(pos)
     tile = empty_tile(max(n, LANES), 1, n - 1, real)
-    tile.order[0, 1:] = len(tile.body) - 1  # nobody
-    tile.body[:n, :2], tile.body[:n, 2:] = pos, vel
-    tile.aim[0] = *goal, np.dot(goal, goal), 0
+    tile.row_slots[0, 1:] = len(tile.pos_vel) - 1  # the padding slot
+    tile.pos_vel[:n, :2], tile.pos_vel[:n, 2:] = pos, vel
+    tile.to_goal[0] = *goal, np.dot(goal, goal), 0
     tile.group[:n] = np.arange(n) // robots
     tile.neighbours[:] = -1
     tile.neighbours[0, 0, :, 0] = np.arange(1, n)
-    tile.counts[0] = n - 1
+    tile.neighbour_counts[0] = n - 1
     _terms(tile, real(gain), f)
-    return tile.terms[0, :, 0].reshape(3, 2)
+    return tile.flock_terms[0, :, 0].reshape(3, 2)
 
 
 @kernel
@@ -239,11 +242,11 @@ def _sum(state, sees, values, out, f):
 
 
 def weighted_sum_of(state, sees, terms, goal, leader, f, lane=2):
-    """The weighted sum `[2]` of one robot in `state`; the other lanes hold other states and values."""
+    """The weighted sum `[2]` of one robot in `state`; the other lanes hold other states and numbers."""
     states = ((np.arange(LANES) - lane + state) % 4).astype(np.int32)
-    seeing = ((np.arange(LANES) - lane + sees) % 2).astype(np.int32)
+    sees_all = ((np.arange(LANES) - lane + sees) % 2).astype(np.int32)
     values = np.random.default_rng(0).normal(size=(10, LANES)).astype(np.float32)
     values[:, lane] = [*terms, *goal, *leader]
     out = np.zeros((2, LANES), np.float32)
-    _sum(states, seeing, values, out, f)
+    _sum(states, sees_all, values, out, f)
     return out[:, lane]

@@ -12,7 +12,7 @@ from sim_core.lanes import LANES
 from sim_core.swarm import step, tile
 from sim_core.swarm.grid import ROW_SPAN_CELLS
 from sim_core.worlds import WorldBatch
-from tests.sim_core.kernels import arranged, orca_step
+from tests.sim_core.kernels import cell_list, orca_step
 from tests.sim_core.swarm.test_neighbours import brute_force
 
 REAL = np.float32
