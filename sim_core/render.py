@@ -1,8 +1,8 @@
-"""One world state as an RGB image, drawn with numpy alone.
+"""Draws one world state as an RGB image, with numpy alone.
 
-The view is fixed to the arena, x to the right and y up. Robots have their true radius (3 px at least) and their
-group's colour; the learning robot is black in a ring of its group's colour, on its sensing disc R2; goals are
-hollow squares, the learning robot's edged in black. What lies outside the view is cut off.
+The view is fixed to the arena; x points right and y up. Robots have their true radius (at least 3 px) and their group's
+colour. The learning robot is black with a ring in its group's colour, and its sensing disc of radius R2 is shaded.
+Goals are hollow squares; the learning robot's goal has a black outline. Shapes outside the view are clipped.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sim_core.scenes.base import GOAL_HALF_SIDE_M
 
 Floats = NDArray[np.floating]
 Shape = Callable[[Floats, Floats], Floats]
-"""Coverage in [0, 1] of pixels whose centres lie (dx, dy) px from the shape's centre; the two broadcast."""
+"""Coverage in [0, 1] of the pixels whose centres lie (dx, dy) px from the shape's centre; dx and dy broadcast."""
 
 GROUP_COLOURS = (
     "#0072B2",
@@ -32,14 +32,14 @@ GROUP_COLOURS = (
     "#999933",
     "#332288",
 )
-"""Group g has colour g modulo the count: Okabe and Ito's seven, then three of Paul Tol's muted scheme."""
+"""Colours of groups 0, 1, ..., repeated cyclically: Okabe and Ito's seven, then three of Paul Tol's muted scheme."""
 
 MIN_ROBOT_RADIUS_PX = 3.0
 WHITE, BLACK, OUTLINE, ARENA, SENSING = "#FFFFFF", "#000000", "#4A4A4A", "#DADDE1", "#666666"
 
 
 def colour_rgb(colour: str) -> NDArray[np.uint8]:
-    """The `[3]` red, green, blue of `#RRGGBB`."""
+    """Red, green and blue `[3]` of a colour `#RRGGBB`."""
     return np.frombuffer(bytes.fromhex(colour.removeprefix("#")), np.uint8)
 
 
@@ -49,12 +49,12 @@ def group_rgb(groups: int) -> NDArray[np.uint8]:
 
 
 def view_half_m(config: WorldConfig) -> float:
-    """Half the edge of the square view around the arena's centre: every start and every goal is inside it."""
+    """Half the edge length of the square view around the arena's centre, metres. All starts and goals lie inside."""
     return config.scene_class.view_half_m(config)
 
 
 def to_pixels(point_m: ArrayLike, config: WorldConfig, size_px: int) -> Floats:
-    """Image coordinates (column, row) `[..., 2]` of points `[..., 2]` in metres; pixel (0, 0) has its centre at 0.5."""
+    """Image coordinates (column, row) `[..., 2]` of points `[..., 2]` in metres. Pixel (0, 0) has its centre at 0.5."""
     half_m = view_half_m(config)
     return (np.asarray(point_m, np.float64) * (1.0, -1.0) / half_m + 1.0) * (0.5 * size_px)
 
@@ -69,7 +69,7 @@ def draw_world(
       goal: `[groups, 2]`, metres.
       learner: index of the learning robot.
       config: the setup.
-      size_px: edge of the square image.
+      size_px: edge length of the square image.
 
     Returns:
       The image `[size_px, size_px, 3]` uint8, RGB.
@@ -94,7 +94,7 @@ def draw_world(
 
 @functools.lru_cache(maxsize=8)
 def _background(config: WorldConfig, size_px: int) -> NDArray[np.uint8]:
-    """White `[size_px, size_px, 3]` with the circle of the start centres; shared, so copy before drawing."""
+    """White image `[size_px, size_px, 3]` with the circle of the group centres; it is cached and read-only."""
     image = np.full((size_px, size_px, 3), 255, np.uint8)
     if not config.scene_class.draws_circle:
         image.setflags(write=False)
@@ -137,7 +137,7 @@ def _ring(radius_px: float, line_px: float) -> Shape:
 
 
 def _frame(half_px: float, line_px: float) -> Shape:
-    """A hollow square: the box out to `half_px` less the box `line_px` further in."""
+    """A hollow square: the box of half edge `half_px` minus the box smaller by `line_px` on every side."""
 
     def box(dx: Floats, dy: Floats, half: float) -> Floats:
         return np.clip(half + 0.5 - np.abs(dx), 0.0, 1.0) * np.clip(half + 0.5 - np.abs(dy), 0.0, 1.0)
@@ -148,16 +148,16 @@ def _frame(half_px: float, line_px: float) -> Shape:
 def _paint(
     image: NDArray[np.uint8],
     centre_px: Floats,
-    reach_px: float,
+    extent_px: float,
     shape: Shape,
     colour: str | NDArray[np.uint8],
     opacity: float = 1.0,
 ) -> None:
-    """Blends one shape that reaches `reach_px` from its centre into `image` `[height, width, 3]`, in place."""
+    """Blends one shape of half extent `extent_px` into `image` `[height, width, 3]`, in place."""
     rgb = (colour_rgb(colour) if isinstance(colour, str) else colour).astype(np.float32)
     limit = np.array(image.shape[1::-1])
-    low = np.clip(np.floor(centre_px - reach_px - 1.0), 0, limit).astype(np.int64)
-    high = np.clip(np.ceil(centre_px + reach_px + 1.0), 0, limit).astype(np.int64)
+    low = np.clip(np.floor(centre_px - extent_px - 1.0), 0, limit).astype(np.int64)
+    high = np.clip(np.ceil(centre_px + extent_px + 1.0), 0, limit).astype(np.int64)
     dx = (np.arange(low[0], high[0]) + 0.5 - centre_px[0]).astype(np.float32)
     dy = (np.arange(low[1], high[1])[:, None] + 0.5 - centre_px[1]).astype(np.float32)
     patch = image[low[1] : high[1], low[0] : high[0]]
@@ -166,7 +166,7 @@ def _paint(
 
 
 def _splat_discs(image: NDArray[np.uint8], centre_px: Floats, radius_px: float, colours: NDArray[np.uint8]) -> None:
-    """Blends discs of one radius into `image` `[size, size, 3]`, all at once and in no order.
+    """Blends discs of one radius into `image` `[size, size, 3]`, all at once, so that their order does not matter.
 
     Args:
       image: changed in place.
@@ -175,8 +175,8 @@ def _splat_discs(image: NDArray[np.uint8], centre_px: Floats, radius_px: float, 
       colours: `[num_discs, 3]` uint8; where discs overlap, their colours mix.
     """
     size = image.shape[0]
-    reach = int(np.ceil(radius_px)) + 1
-    near = np.floor(centre_px).astype(np.int64)[:, :, None] + np.arange(-reach, reach + 1)
+    extent = int(np.ceil(radius_px)) + 1
+    near = np.floor(centre_px).astype(np.int64)[:, :, None] + np.arange(-extent, extent + 1)
     columns, rows = near[:, 0], near[:, 1]
     dx, dy = columns + 0.5 - centre_px[:, :1], rows + 0.5 - centre_px[:, 1:]
     cover = _disc(radius_px)(dx[:, None, :], dy[:, :, None])

@@ -36,7 +36,7 @@ NEAR_FLOAT64_M_S = 1e-4
 """Nine robots in ten of every kind of scene must be this near to float64 after one step."""
 SPEED_ROUNDING = 1 + 1e-5
 PARITY_COLUMNS = ("scenes", "robots", "bit for bit", "largest difference, m/s", "none permitted", "RVO2 too fast",
-                  "ties", "same place", "unexplained")  # fmt: skip
+                  "ties", "coincident", "unexplained")  # fmt: skip
 SWARM_COLUMNS = ("episodes", "with overlap", "steps with overlap", "smallest distance, m", "largest speed, m/s",
                  "arrived", "median arrival, steps")  # fmt: skip
 
@@ -58,7 +58,7 @@ def main(argv: list[str] | None = None) -> int:
 def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.exactness", description=__doc__)
     parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=list(SECTIONS))
-    parser.add_argument("--scenes", type=int, default=12_000, help="scenes with the worlds' own settings")
+    parser.add_argument("--scenes", type=int, default=12_000, help="scenes with the default settings")
     parser.add_argument("--episodes", type=int, default=1000, help="episodes of each setup of the swarm alone")
     parser.add_argument("--setups", nargs="+", type=setup, default=SWARM_SETUPS, help="of the swarm: 25x8 ...")
     parser.add_argument("--world", nargs="+", type=setting, default=[], help="of the swarm: orca_radius_m=0.16 ...")
@@ -102,7 +102,7 @@ def new_table(title: str, *columns: str, names: int = 1) -> Table:
 
 
 def parity_row(scenes: int, found: Parity) -> list[str]:
-    counts = (found.infeasible, found.too_fast, found.ties, found.same_place, found.unexplained)
+    counts = (found.infeasible, found.too_fast, found.ties, found.coincident, found.unexplained)
     share = f"{100 * found.equal / found.robots:.2f} %"
     return [f"{scenes:,}", f"{found.robots:,}", share, f"{found.worst_m_s:.1e}", *(f"{count:,}" for count in counts)]
 

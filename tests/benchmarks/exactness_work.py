@@ -17,7 +17,7 @@ WATCHED_STEPS = tuple(range(50, WHOLE_STEPS + 1, 50))
 
 
 def scene_parity(kind: str, numbers: range, settings: dict[str, float]) -> tuple[Parity, list[int]]:
-    """Parity of one step of numbered scenes, and the scenes where a robot differs from RVO2 without an excuse."""
+    """Parity of one step of numbered scenes, and the scenes in which a robot is unexplained."""
     found = [compare(numbered_scene(kind, number), **settings) for number in numbers]
     return total(found), [number for number, one in zip(numbers, found, strict=True) if one.unexplained]
 

@@ -1,4 +1,4 @@
-"""Hand-made worlds for the tests of sim_core."""
+"""Fixtures that make worlds by hand for the tests of sim_core."""
 
 import numpy as np
 import pytest
@@ -27,11 +27,11 @@ def _make_flock(config, pos, goals, vel=None, seed=0):
 
 @pytest.fixture(scope="session")
 def make_state():
-    """Function: one world's WorldState from pos `[num_robots, 2]`, goals `[groups, 2]`, vel, learner, seed."""
+    """A function: WorldState of a world from config, pos `[num_robots, 2]`, goals `[groups, 2]`, vel, learner, seed."""
     return _make_state
 
 
 @pytest.fixture(scope="session")
 def make_flock():
-    """Function: Flock of one world from config, pos `[num_robots, 2]`, goals `[groups, 2]`, vel, seed."""
+    """A function: Flock of a world from config, pos `[num_robots, 2]`, goals `[groups, 2]`, vel, seed."""
     return _make_flock

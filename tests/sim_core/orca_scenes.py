@@ -1,6 +1,6 @@
-"""Random scenes of robots for ORCA, and which robots of a scene are special.
+"""Random scenes of robots for ORCA, and masks of the special robots of a scene.
 
-A scene is positions, velocities and preferred velocities, each `[n, 2]` float32.
+A scene holds positions, velocities and preferred velocities, each `[n, 2]` float32.
 """
 
 from typing import NamedTuple
@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 MAX_SPEED_M_S = 1.0
-MOST_ROBOTS = 300
+MAX_ROBOTS = 300
 
 
 class Scene(NamedTuple):
-    """One world's robots as ORCA sees them, `[n, 2]` float32 each: m, m/s, m/s."""
+    """ORCA's input of one world, `[n, 2]` float32 each: positions (m), velocities and preferred velocities (m/s)."""
 
     pos: np.ndarray
     vel: np.ndarray
@@ -20,20 +20,20 @@ class Scene(NamedTuple):
 
 
 def random_scene(kind, rng, n=None):
-    """A scene of `kind` (one of KINDS) with `n` robots; by default 2 to 300, small worlds as often as large."""
+    """A scene of `kind` (one of KINDS) with `n` robots; by default 2 to 300, log-uniformly distributed."""
     if n is None:
-        n = int(np.exp(rng.uniform(np.log(2), np.log(MOST_ROBOTS + 1))))
+        n = int(np.exp(rng.uniform(np.log(2), np.log(MAX_ROBOTS + 1))))
     pos, vel, pref = SCENES[kind](n, rng)
     return Scene(*(np.asarray(array, np.float32) for array in (pos, vel, pref)))
 
 
 def numbered_scene(kind, number, n=None):
-    """Scene `number` of `kind`: the same one whenever it is asked for."""
+    """Scene `number` of `kind`; the same arguments always give the same scene."""
     return random_scene(kind, np.random.default_rng([KINDS.index(kind), number]), n)
 
 
 class WorldScene(NamedTuple):
-    """One world of a batch, `[n, 2]` float32 each: m, m/s, and each robot's own goal, m."""
+    """One world of a batch, `[n, 2]` float32 each: positions (m), velocities (m/s) and each robot's goal (m)."""
 
     pos: np.ndarray
     vel: np.ndarray
@@ -41,21 +41,21 @@ class WorldScene(NamedTuple):
 
 
 def world_scene(worlds, world):
-    """Where the robots of a world of a WorldBatch are, how they move and where they want to go."""
+    """The WorldScene of one world of a WorldBatch."""
     state = worlds.get_state()
     vel = np.stack([state["vel_x"][world], state["vel_y"][world]], axis=-1)
     return WorldScene(worlds.positions()[world], vel, np.repeat(worlds.goals()[world], worlds.config.robots, axis=0))
 
 
 def heading_scene(worlds, world, rng):
-    """A world of a WorldBatch as ORCA's scene: robots prefer full speed towards their goal, with some noise."""
+    """A Scene of one world of a WorldBatch; robots prefer full speed towards their goals, with some noise."""
     pos, vel, goal = world_scene(worlds, world)
     heading = (goal - pos) / np.linalg.norm(goal - pos, axis=1, keepdims=True)
     return Scene(pos, vel, (heading + rng.normal(0, 0.1, pos.shape)).astype(np.float32))
 
 
 def goal_scene(worlds, world):
-    """A world of a WorldBatch without flocking as ORCA's scene, in the order of operations of the worlds."""
+    """A Scene of one world of a WorldBatch without flocking, with the kernels' order of operations."""
     pos, vel, goal = world_scene(worlds, world)
     x, y = (goal - pos).T
     length_sq = x * x + y * y
@@ -64,7 +64,7 @@ def goal_scene(worlds, world):
 
 
 def _velocities(n, rng):
-    """Random velocities no faster than the limit, and preferred ones that may be."""
+    """Random velocities within the speed limit, and preferred velocities that may exceed it."""
     vel = rng.normal(0, 0.5, (n, 2))
     vel *= np.minimum(1, MAX_SPEED_M_S / np.linalg.norm(vel, axis=1, keepdims=True))
     return vel, rng.normal(0, 0.7, (n, 2))
@@ -82,20 +82,20 @@ def _grid(n):
 
 
 def _jammed(n, rng):
-    """A shaken grid: everybody touches somebody."""
+    """A grid with jitter, so dense that every robot touches another."""
     return 0.42 * _grid(n) + rng.uniform(-0.02, 0.02, (n, 2)), *_velocities(n, rng)
 
 
 def _head_on(n, rng):
-    """Two walls that run into each other."""
+    """Two rows of robots that meet head on."""
     side = np.where(np.arange(n) % 2, 1.0, -1.0)
     pos = np.stack([side * rng.uniform(0.25, 0.8, n), rng.uniform(0, 0.6 * np.sqrt(n), n)], axis=1)
     vel = np.stack([-side, rng.normal(0, 1e-3, n)], axis=1)
     return pos, vel, np.stack([-1.2 * side, np.zeros(n)], axis=1)
 
 
-def _same_place(n, rng):
-    """Every third robot stands exactly where another one does; half of those share its velocity too."""
+def _coincident(n, rng):
+    """Every third robot has exactly the position of another; half of these have its velocity too."""
     pos, vel, pref = _scattered(0.5)(n, rng)
     pos, vel = pos.astype(np.float32), vel.astype(np.float32)
     for i in range(0, n, 3):
@@ -112,9 +112,9 @@ def _at_rest(n, rng):
 
 
 def _lattice(n, rng):
-    """Multiples of a power of two: exact distance ties everywhere, and robots exactly at the range's end.
+    """A lattice of exact floats: exact distance ties everywhere, and robots at exactly the range's distance.
 
-    Velocities are random, on a lattice too, or all the same, so that half-planes coincide or oppose each other.
+    Velocities are random, or on a lattice too, or all equal. Half-planes then coincide or oppose each other.
     """
     pos = _grid(n) * rng.choice([0.25, 0.375, 0.5, 0.75]) + rng.integers(-4, 5, 2)
     vel, pref = _velocities(n, rng)
@@ -126,15 +126,15 @@ def _lattice(n, rng):
     return pos, vel, pref
 
 
-def _turned_lattice(n, rng):
-    """A lattice turned by any angle: everything that ties or is parallel there is so but for rounding."""
+def _rotated_lattice(n, rng):
+    """A lattice rotated by a random angle: its ties and parallels are exact up to rounding."""
     angle = rng.uniform(0, 2 * np.pi)
-    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    return tuple(array @ turn for array in _lattice(n, rng))
+    rotation = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    return tuple(array @ rotation for array in _lattice(n, rng))
 
 
 def _patches(n, rng):
-    """Heaps of one to twelve robots out of each other's range: robots with few neighbours beside some with many."""
+    """Clusters of 1 to 12 robots out of each other's range: robots with few neighbours beside robots with many."""
     patch = np.searchsorted(np.cumsum(rng.integers(1, 13, n)), np.arange(n), side="right")
     centre = 4.0 * _grid(n)[patch]
     pos = centre + rng.choice([0.1, 0.25, 0.5]) * rng.normal(0, 1, (n, 2))
@@ -143,7 +143,7 @@ def _patches(n, rng):
 
 
 def _crossing(n, rng):
-    """Two to eight groups on their way through one place."""
+    """Two to eight groups that cross at one point."""
     groups = int(rng.integers(2, 9))
     angle = rng.uniform(0, 2 * np.pi) + 2 * np.pi * (np.arange(n) % groups) / groups
     outwards = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -158,20 +158,20 @@ SCENES = {
     "jammed": _jammed,
     "overlapping": _scattered(0.2),
     "head-on": _head_on,
-    "same place": _same_place,
+    "coincident": _coincident,
     "at rest": _at_rest,
     "lattice": _lattice,
-    "turned lattice": _turned_lattice,
+    "rotated lattice": _rotated_lattice,
     "crossing": _crossing,
     "patches": _patches,
 }
 KINDS = tuple(SCENES)
-GENERIC_KINDS = tuple(kind for kind in KINDS if kind not in ("same place", "lattice", "turned lattice"))
-"""Kinds whose robots neither coincide nor tie nor have parallel half-planes, but by a rare chance."""
+GENERIC_KINDS = tuple(kind for kind in KINDS if kind not in ("coincident", "lattice", "rotated lattice"))
+"""Kinds whose robots almost never coincide, tie or have parallel half-planes."""
 
 
 def distances_sq(pos):
-    """Squared distances `[n, n]` between all robots in the dtype of `pos`, infinite to oneself."""
+    """Squared distances `[n, n]` between all robots in the dtype of `pos`; infinity on the diagonal."""
     delta = pos[:, None] - pos[None]
     dist_sq = delta[..., 0] * delta[..., 0] + delta[..., 1] * delta[..., 1]
     np.fill_diagonal(dist_sq, np.inf)
@@ -179,9 +179,10 @@ def distances_sq(pos):
 
 
 def tie_margin_sq(pos, range_m=1.5, max_neighbours=10):
-    """Per robot, the smallest difference of two squared distances that fill or bound its neighbour list, m^2.
+    """Per robot, the smallest difference between two squared distances in its neighbour list, m^2.
 
-    Where it is 0 (a tie), the worlds order the two neighbours by index and RVO2 by its tree.
+    The first robot that does not fit into the list counts too. Where the difference is 0 (a tie), the kernels order the
+    two neighbours by index and RVO2 by its tree.
     """
     dist_sq = distances_sq(pos)
     nearest = np.sort(np.where(dist_sq < pos.dtype.type(range_m) ** 2, dist_sq, np.inf), axis=1)
@@ -192,10 +193,10 @@ def tie_margin_sq(pos, range_m=1.5, max_neighbours=10):
 
 
 def range_margin_sq(pos, range_m=1.5):
-    """Per robot, how near another one is to the edge of its neighbour range, in squared distances, m^2."""
+    """Per robot, the smallest difference between another one's squared distance and the squared range, m^2."""
     return np.abs(distances_sq(pos) - range_m**2).min(axis=1)
 
 
 def coincides(pos):
-    """Per robot, whether another one stands in the same place."""
+    """Per robot, whether another one has the same position."""
     return (distances_sq(pos) == 0).any(axis=1)

@@ -1,4 +1,4 @@
-"""What float32 costs: the same kernel and the same scenes in float32 and in float64."""
+"""Accuracy of float32: the same kernels and scenes in float32 and in float64."""
 
 import numpy as np
 
@@ -9,16 +9,16 @@ DRIFT_STEPS = (1, 10, 50)
 
 
 def one_step_difference(scene):
-    """Per robot, how far the float32 velocity is from the float64 one, m/s."""
+    """Per robot, the distance of the float32 velocity from the float64 velocity, m/s."""
     new = [orca_velocities(*scene, real=real).astype(np.float64) for real in (np.float32, np.float64)]
     return np.linalg.norm(new[0] - new[1], axis=1)
 
 
 def drifts(pos, vel, goal):
-    """How far float32 positions are from float64 ones after DRIFT_STEPS steps of ORCA towards the goals.
+    """Distances of float32 positions from float64 positions after DRIFT_STEPS steps of ORCA towards the goals.
 
     Args:
-      pos, vel, goal: `[n, 2]` float32, where both runs start, and each robot's goal.
+      pos, vel, goal: `[n, 2]` float32, the start of both runs and each robot's goal.
 
     Returns:
       `[len(DRIFT_STEPS), n]` float64, metres.
@@ -28,7 +28,7 @@ def drifts(pos, vel, goal):
 
 
 def path(pos, vel, goal, real):
-    """Positions `[len(DRIFT_STEPS), n, 2]` float64 of robots that head for their goals at full speed."""
+    """Positions `[len(DRIFT_STEPS), n, 2]` float64 of robots that head for their goals."""
     pos, vel, goal = (np.asarray(array, real) for array in (pos, vel, goal))
     time_step_s, found = real(DEFAULTS["time_step_s"]), []
     for step in range(1, max(DRIFT_STEPS) + 1):

@@ -1,5 +1,6 @@
-"""Compiled kernels are kept on disk, never outlive the sources that they were compiled from, and cannot allocate."""
+"""Compiled kernels are cached on disk, are compiled anew when a source changes, and cannot allocate memory."""
 
+import inspect
 import os
 import re
 import shutil
@@ -18,7 +19,7 @@ from sim_core.jit import inlined, kernel
 
 ROOT = Path(sim_core.__file__).parents[1]
 
-START = """
+START_A_WORLD = """
 import numba
 before = numba.config.CACHE_DIR
 import numpy as np
@@ -33,62 +34,89 @@ print(state.pos_x.sum() + state.pos_y.sum(), numba.config.CACHE_DIR == before)
 """
 
 
-def start(folder):
-    """What the sources in `folder` say in a new process: (sum of a world's start positions, setting untouched)."""
+def start_a_world(folder):
+    """Runs the sources in `folder` in a new process: (sum of the start positions, whether CACHE_DIR is unchanged)."""
     env = os.environ | {"PYTHONPATH": str(folder), "NUMBA_CACHE_DIR": str(folder / "cache")}
     done = subprocess.run(
-        [sys.executable, "-c", START], cwd=folder, env=env, capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", START_A_WORLD], cwd=folder, env=env, capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0, done.stderr
-    total, untouched = done.stdout.split()
-    return float(total), untouched == "True"
+    total, unchanged = done.stdout.split()
+    return float(total), unchanged == "True"
 
 
-def kept(folder):
-    """Files of compiled kernels, by the folder of the sources' version."""
+def cached(folder):
+    """Modification times of the files in the cache folders."""
     files = [path for path in (folder / "cache").rglob("*.nb?")]
     assert all(path.relative_to(folder / "cache").parts[0].startswith("kernels-") for path in files)
     return {path: path.stat().st_mtime_ns for path in files}
 
 
-def change(source, pattern, value):
-    """Writes `value` in the place of the one text in a source that matches `pattern`."""
+def copy_packages(folder, *names):
+    for name in names:
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+
+
+def replace(source, pattern, value):
+    """Replaces the only match of `pattern` in a source by `value`."""
     changed, count = re.subn(pattern, value, source.read_text())
     assert count == 1
     source.write_text(changed)
 
 
-def test_kernels_follow_changes_of_any_source(tmp_path):
-    shutil.copytree(ROOT / "sim_core", tmp_path / "sim_core", ignore=shutil.ignore_patterns("__pycache__"))
-    first = start(tmp_path)
-    compiled = kept(tmp_path)
-    assert compiled and start(tmp_path) == first and kept(tmp_path) == compiled  # nothing compiled anew
-    change(tmp_path / "sim_core" / "rng.py", r"(?<=_MIX_1 = np.uint64\()0xBF58476D1CE4E5B9", "0xBF58476D1CE4E5BB")
-    second = start(tmp_path)  # the kernel is in circle.py, which is as it was
+def append_a_comment(source):
+    with source.open("a") as file:
+        file.write("# changed\n")
+
+
+def test_kernels_are_compiled_anew_when_an_inlined_kernel_of_another_file_changes(tmp_path):
+    copy_packages(tmp_path, "sim_core")
+    first = start_a_world(tmp_path)
+    compiled = cached(tmp_path)
+    assert compiled and start_a_world(tmp_path) == first and cached(tmp_path) == compiled  # nothing was compiled anew
+    replace(tmp_path / "sim_core" / "rng.py", r"(?<=_MIX_1 = np.uint64\()0xBF58476D1CE4E5B9", "0xBF58476D1CE4E5BB")
+    second = start_a_world(tmp_path)  # calls a kernel in scenes/circle.py, which has not changed
     assert second[0] != first[0]
     assert first[1] and second[1]
-    both = kept(tmp_path)
+    both = cached(tmp_path)
     assert compiled.items() < both.items() and len(both) == 2 * len(compiled)
 
 
-def test_kernels_follow_changes_of_the_neighbours_that_have_kernels(tmp_path):
-    for package in ("sim_core", *jit.NEIGHBOURS):
-        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    start(tmp_path)
-    for name, follows in (
+def test_a_changed_kernel_in_a_subfolder_of_any_package_starts_another_cache_folder(tmp_path):
+    copy_packages(tmp_path, "sim_core", *jit.KERNEL_PACKAGES)
+    start_a_world(tmp_path)
+    for name, has_kernels in (
+        ("sim_core/swarm/neighbours.py", True),
         ("actors/policy/mlp_kernels.py", True),
         ("learner/update/compiled_updates.py", True),
         ("actors/service/rpc.py", False),
     ):
         before = len(list((tmp_path / "cache").iterdir()))
-        with (tmp_path / name).open("a") as source:
-            source.write("# changed\n")
-        start(tmp_path)
-        assert len(list((tmp_path / "cache").iterdir())) == before + follows
+        append_a_comment(tmp_path / name)
+        start_a_world(tmp_path)
+        assert len(list((tmp_path / "cache").iterdir())) == before + has_kernels
 
 
-def test_other_users_of_numba_keep_their_setting(monkeypatch):
-    for setting in ("", "/nowhere/cache"):
+def test_the_cache_folder_depends_on_every_source_with_kernels(monkeypatch, tmp_path):
+    """Wherever a kernel lies: all sources that decorate a function as a kernel are found by their text."""
+    copy_packages(tmp_path, "sim_core", "actors", "learner", "deploy", "dashboards")
+    functions = inspect.getmembers(jit, lambda value: inspect.isfunction(value) and value.__module__ == jit.__name__)
+    decorators = [name for name, _ in functions if not name.startswith("_")]
+    decorated = re.compile(rf"^@({'|'.join(decorators)})$", re.MULTILINE)
+    sources = [path for path in sorted(tmp_path.rglob("*.py")) if decorated.search(path.read_text())]
+    in_subfolders = [path.relative_to(tmp_path).parts[0] for path in sources if path.parents[1] != tmp_path]
+    assert set(in_subfolders) == {"sim_core", *jit.KERNEL_PACKAGES}
+    assert len(sources) > len(in_subfolders)  # sim_core has kernels outside subfolders, too
+    monkeypatch.setattr(jit, "__file__", str(tmp_path / "sim_core" / "jit.py"))
+    folders = {jit._cache_folder()}
+    for count, source in enumerate(sources, start=2):
+        append_a_comment(source)
+        folders.add(jit._cache_folder())
+        assert len(folders) == count, source
+
+
+def test_other_users_of_numba_keep_their_cache_folder(monkeypatch):
+    for setting in ("", "/some/cache"):
         monkeypatch.setattr(numba.config, "CACHE_DIR", setting)
         kernel(lambda x: x + 1)
         inlined(lambda x: x + 1)
@@ -97,7 +125,7 @@ def test_other_users_of_numba_keep_their_setting(monkeypatch):
         assert numba.config.CACHE_DIR == setting
 
 
-def test_kernels_are_kept_beside_the_sources_or_in_the_users_cache(monkeypatch, tmp_path):
+def test_kernels_are_cached_beside_the_sources_or_in_the_users_cache(monkeypatch, tmp_path):
     package = ROOT / "sim_core"
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     monkeypatch.setattr(jit.os, "access", lambda path, mode: True)
@@ -148,6 +176,6 @@ def test_a_kernel_that_allocates_is_refused(function, argument):
         kernel(function)(argument)
 
 
-def test_division_by_zero_is_that_of_ieee():
+def test_division_by_zero_follows_ieee_754():
     divide = kernel(lambda x, y: x / y)
     assert divide(1.0, 0.0) == np.inf and np.isnan(divide(0.0, 0.0))

@@ -1,4 +1,4 @@
-"""Every operation on vectors against numpy, bit for bit, on ordinary and on special numbers."""
+"""Every operation on vectors against numpy, bit for bit, with ordinary and special numbers."""
 
 import itertools
 
@@ -10,16 +10,16 @@ from sim_core.jit import kernel
 from sim_core.lanes import (
     LANES,
     any_lane,
+    extract_lane,
     gather,
     gather_4,
-    lane,
     load,
     maximum,
     minimum,
-    root,
     scatter,
     select,
     splat,
+    sqrt,
     store,
 )
 
@@ -29,23 +29,23 @@ MASKS = 256  # all masks of eight lanes
 
 
 def special_numbers(dtype):
-    """Ordinary, extreme and odd numbers of a type."""
+    """Ordinary, extreme and special numbers of a type."""
     drawn = np.random.default_rng(0).normal(0, 3, 9)
     if dtype == np.int32:
         return np.array([0, 1, -1, 2, 7, -13, 2**31 - 1, -(2**31), *(1000 * drawn)]).astype(dtype)
     limits = np.finfo(dtype)
-    odd = [0.0, -0.0, np.inf, -np.inf, np.nan, 1.0, -1.0, limits.max, -limits.max, limits.tiny, limits.eps]
-    return np.array([*odd, limits.smallest_subnormal, -limits.smallest_subnormal, 3.0, -2.5, *drawn], dtype)
+    special = [0.0, -0.0, np.inf, -np.inf, np.nan, 1.0, -1.0, limits.max, -limits.max, limits.tiny, limits.eps]
+    return np.array([*special, limits.smallest_subnormal, -limits.smallest_subnormal, 3.0, -2.5, *drawn], dtype)
 
 
 def pairs(dtype):
-    """All pairs of special numbers, some twice so that vectors are full: two arrays of equal size."""
+    """All pairs of special numbers as two arrays of equal size; some pairs repeat, so that all vectors are full."""
     found = np.array(list(itertools.product(special_numbers(dtype), repeat=2)), dtype).T
     return np.ascontiguousarray(np.resize(found, (2, -(-found.shape[1] // LANES) * LANES)))
 
 
 def assert_same_bits(found, expected, message=""):
-    """Equal in every bit, except that any NaN is as good as another."""
+    """Equal in every bit, except that all NaNs count as equal."""
     found, expected = np.asarray(found), np.asarray(expected)
     assert (found.dtype, found.shape) == (expected.dtype, expected.shape), message
     if found.dtype.kind == "f":
@@ -54,7 +54,7 @@ def assert_same_bits(found, expected, message=""):
 
 
 def assert_all_same(found, expected):
-    """Row by row, the results of a kernel and what numpy says, by name."""
+    """The rows of a kernel's results are numpy's results, given by name."""
     for row, (name, values) in zip(found, expected.items(), strict=True):
         assert_same_bits(row, values, name)
 
@@ -81,7 +81,7 @@ def _arithmetic(a, b, scalar, out, masks):
 def arithmetic_of_numpy(x, y, s):
     """(results, comparisons) by name, in the order of `_arithmetic`."""
     two, every = x.dtype.type(2), np.full_like(x, s)
-    differ = (x < y) | (x > y)  # NaN differs from nothing
+    differ = (x < y) | (x > y)  # ordered: false with NaN
     results = {
         "x + y": x + y, "x - y": x - y, "x * y": x * y, "x * y + x": x * y + x, "x + s": x + s, "s + x": s + x,
         "x - s": x - s, "s - x": s - x, "x * s": x * s, "s * x": s * x, "x + 2": x + two, "2 - x": two - x,
@@ -97,7 +97,7 @@ def arithmetic_of_numpy(x, y, s):
 
 
 @pytest.mark.parametrize("dtype", TYPES)
-def test_arithmetic_comparison_and_choice(dtype):
+def test_arithmetic_comparison_and_select(dtype):
     a, b = pairs(dtype)
     for scalar in special_numbers(dtype):
         with np.errstate(all="ignore"):
@@ -109,35 +109,35 @@ def test_arithmetic_comparison_and_choice(dtype):
 
 
 @kernel
-def _of_reals(a, b, scalar, out):
+def _float_arithmetic(a, b, scalar, out):
     vectors = a.shape[0] // LANES
     for i in range(vectors):
         x, y = load(a, i), load(b, i)
         results = (
-            x / y, x / scalar, scalar / x, root(x), -x, abs(x), minimum(x, y), maximum(x, y), x / 3, 0.1 * x,
+            x / y, x / scalar, scalar / x, sqrt(x), -x, abs(x), minimum(x, y), maximum(x, y), x / 3, 0.1 * x,
         )  # fmt: skip
         for k in range(len(results)):
             store(out, k * vectors + i, results[k])
 
 
 @pytest.mark.parametrize("dtype", REALS)
-def test_arithmetic_of_real_numbers_alone(dtype):
+def test_arithmetic_of_floats(dtype):
     a, b = pairs(dtype)
     for scalar in special_numbers(dtype):
         with np.errstate(all="ignore"):
             expected = {
-                "x / y": a / b, "x / s": a / scalar, "s / x": scalar / a, "root": np.sqrt(a), "-x": -a,
+                "x / y": a / b, "x / s": a / scalar, "s / x": scalar / a, "sqrt": np.sqrt(a), "-x": -a,
                 "abs": np.abs(a),
                 "minimum": np.where(a < b, a, b), "maximum": np.where(a > b, a, b), "x / 3": a / dtype(3),
                 "0.1 * x": dtype(0.1) * a,
             }  # fmt: skip
         out = np.full((len(expected), len(a)), 77, dtype)
-        _of_reals(a, b, scalar, out)
+        _float_arithmetic(a, b, scalar, out)
         assert_all_same(out, expected)
 
 
 @kernel
-def _of_whole_numbers(a, b, scalar, out):
+def _bitwise(a, b, scalar, out):
     vectors = a.shape[0] // LANES
     for i in range(vectors):
         x, y = load(a, i), load(b, i)
@@ -146,7 +146,7 @@ def _of_whole_numbers(a, b, scalar, out):
             store(out, k * vectors + i, results[k])
 
 
-def test_bits_of_whole_numbers():
+def test_bitwise_operations_of_integers():
     a, b = pairs(np.int32)
     for s in special_numbers(np.int32):
         expected = {
@@ -154,7 +154,7 @@ def test_bits_of_whole_numbers():
             "x & 6": a & 6, "x | 1": a | 1, "splat": np.full_like(a, -7),
         }  # fmt: skip
         out = np.full((len(expected), len(a)), 77, np.int32)
-        _of_whole_numbers(a, b, s, out)
+        _bitwise(a, b, s, out)
         assert_all_same(out, expected)
 
 
@@ -180,7 +180,7 @@ def test_masks():
         _masks(a.ravel(), b.ravel(), flag, out, some)
         expected = (p & q, p | q, ~p, p == q, p != q, p ^ q, ~no, no, no | flag)
         np.testing.assert_array_equal(out, np.array(expected).astype(np.int32))
-        np.testing.assert_array_equal(some, np.tile(np.arange(MASKS) > 0, 3))  # the mask 0 is the empty one
+        np.testing.assert_array_equal(some, np.tile(np.arange(MASKS) > 0, 3))  # only mask 0 is empty
 
 
 @kernel
@@ -195,18 +195,18 @@ def _memory(source, table, indices, rows, out, columns, scattered, lanes):
         for k in range(4):
             store(columns, 4 * i + k, four[k])
         for k in range(LANES):
-            lanes[i, k] = lane(found, k)
-    return lane(load(source, 0), 2)
+            lanes[i, k] = extract_lane(found, k)
+    return extract_lane(load(source, 0), 2)
 
 
 @pytest.mark.parametrize("dtype", TYPES)
 def test_reading_and_writing_memory(dtype):
     rng = np.random.default_rng(1)
     vectors, size = 20, 20 * LANES
-    source = rng.integers(-1000, 1000, (4, size // 4)).astype(dtype)  # seen flat
+    source = rng.integers(-1000, 1000, (4, size // 4)).astype(dtype)  # indexed flat
     table = rng.integers(-1000, 1000, (5, 6, 4)).astype(dtype)
     indices = rng.integers(0, size, (vectors, LANES)).astype(np.int32)
-    indices[3], indices[4], indices[5] = 7, np.arange(LANES)[::-1], [0, size - 1] * 4  # repeated, turned, at the ends
+    indices[3], indices[4], indices[5] = 7, np.arange(LANES)[::-1], [0, size - 1] * 4  # repeated, reversed, at the ends
     rows = rng.integers(0, 30, (vectors, LANES)).astype(np.int32)
     rows[1], rows[2] = 29, [0, 29] * 4
     out, lanes = np.zeros((2, vectors, LANES), dtype)
@@ -219,7 +219,7 @@ def test_reading_and_writing_memory(dtype):
     assert_same_bits(columns, table.reshape(30, 4)[rows].transpose(0, 2, 1))
     expected = np.full(size, 77, dtype)
     for i in range(vectors - 1, -1, -1):
-        for k in range(LANES):  # where an index is repeated, the last lane stays
+        for k in range(LANES):  # where an index is repeated, the last lane's value stays
             expected[indices[i, k]] = flat[LANES * i + k]
     assert_same_bits(scattered, expected)
 
@@ -232,11 +232,11 @@ def _compares(a, b):
     return any_lane(load(a, 0) < load(b, 0))
 
 
-def _adds_a_name(a, b):
+def _adds_a_string(a, b):
     store(a, 0, load(a, 0) + "1")
 
 
-def _adds_nothing(a, b):
+def _adds_none(a, b):
     store(a, 0, None + load(a, 0))
 
 
@@ -248,7 +248,7 @@ def _floor_divides(a, b):
     store(a, 0, load(a, 0) // 2)
 
 
-def _asks_for_truth(a, b):
+def _takes_truth_value(a, b):
     return 1 if load(a, 0) < 0 else 2
 
 
@@ -259,21 +259,21 @@ def test_two_element_types_do_not_mix(function, dtype):
         kernel(function)(np.zeros(LANES, np.float32), np.zeros(LANES, dtype))
 
 
-@pytest.mark.parametrize("function", [_adds_a_name, _adds_nothing, _adds_an_array, _floor_divides, _asks_for_truth])
-def test_what_a_vector_cannot_do_is_refused(function):
+@pytest.mark.parametrize("function", [_adds_a_string, _adds_none, _adds_an_array, _floor_divides, _takes_truth_value])
+def test_unsupported_operations_are_refused(function):
     with pytest.raises(TypingError, match="Lanes"):
         kernel(function)(np.zeros(LANES, np.float32), np.zeros(LANES, np.float32))
 
 
-def _fraction(a):
+def _adds_a_fraction(a):
     store(a, 0, load(a, 0) + 0.7)
 
 
-def test_a_fraction_is_not_cut_off_to_fit_whole_numbers():
+def test_a_fraction_is_not_truncated_to_an_integer():
     with pytest.raises(TypingError):
-        kernel(_fraction)(np.zeros(LANES, np.int32))
+        kernel(_adds_a_fraction)(np.zeros(LANES, np.int32))
 
 
 def test_a_strided_array_is_refused():
     with pytest.raises(TypingError):
-        kernel(_fraction)(np.zeros(2 * LANES, np.float32)[::2])
+        kernel(_adds_a_fraction)(np.zeros(2 * LANES, np.float32)[::2])

@@ -1,4 +1,4 @@
-"""ORCA's linear programs against enumeration of all candidate points and scipy's SLSQP, in float64.
+"""ORCA's linear programs against an enumeration of all candidate points and scipy's SLSQP, in float64.
 
 A half-plane is (point, unit direction d); its violation at v is det(d, point - v) = offset - n . v with
 the inward normal n = (-d_y, d_x).
@@ -19,7 +19,7 @@ ATOL = 1e-6
 
 
 def random_lines(rng, count, spread):
-    """Half-planes `[count, 4]` with points scattered by `spread`; a few directions (anti-)parallel to others."""
+    """Half-planes `[count, 4]` with points of standard deviation `spread`; some are parallel or antiparallel."""
     angle = rng.uniform(-np.pi, np.pi, count)
     if count > 2 and rng.random() < 0.3:
         angle[1] = angle[0] + np.pi * rng.integers(2)
@@ -33,13 +33,13 @@ def normals_and_offsets(lines):
 
 
 def violation(lines, v):
-    """Largest violation `[...]` at the points v `[..., 2]`."""
+    """The largest violation `[...]` of the velocities v `[..., 2]`."""
     normal, offset = normals_and_offsets(lines)
     return (offset - np.asarray(v) @ normal.T).max(axis=-1)
 
 
 def on_circle(normal, offset, limit):
-    """The points of the circle where normal . v = offset (any length of normal)."""
+    """The points of the circle |v| = limit with normal . v = offset; the normal may have any length."""
     length = np.linalg.norm(normal)
     if length < 1e-12 or abs(offset) > limit * length:
         return []
@@ -48,8 +48,8 @@ def on_circle(normal, offset, limit):
     return [foot + half * along, foot - half * along]
 
 
-def nearest_permitted(lines, limit, opt):
-    """The permitted velocity nearest to `opt`, or None: best of all points where the optimum can lie."""
+def closest_permitted(lines, limit, opt):
+    """The permitted velocity closest to `opt`, or None: the best of all points where the optimum can lie."""
     normal, offset = normals_and_offsets(lines)
     length = np.linalg.norm(opt)
     points = [opt if length <= limit else opt / length * limit]
@@ -61,19 +61,19 @@ def nearest_permitted(lines, limit, opt):
         if abs(np.linalg.det(pair)) > 1e-12:
             points.append(np.linalg.solve(pair, offset[[i, j]]))
     points = np.array(points)
-    fine = (violation(lines, points) < 1e-9) & (np.linalg.norm(points, axis=1) < limit + 1e-9)
-    if not fine.any():
+    permitted = (violation(lines, points) < 1e-9) & (np.linalg.norm(points, axis=1) < limit + 1e-9)
+    if not permitted.any():
         return None
-    return min(points[fine], key=lambda v: np.linalg.norm(v - opt))
+    return min(points[permitted], key=lambda v: np.linalg.norm(v - opt))
 
 
 def least_violation(lines, limit):
-    """Smallest possible largest violation in the disc: best of all points where the optimum can lie."""
+    """The minimum over the disc of the largest violation: the best of all points where the optimum can lie."""
     normal, offset = normals_and_offsets(lines)
     points = list(limit * normal)
     for i, j in itertools.combinations(range(len(lines)), 2):
         points += on_circle(normal[i] - normal[j], offset[i] - offset[j], limit)
-        points.append(0.5 * (lines[i, :2] + lines[j, :2]))  # matters for antiparallel pairs
+        points.append(0.5 * (lines[i, :2] + lines[j, :2]))  # needed for antiparallel pairs
     for triple in itertools.combinations(range(len(lines)), 3):
         system = np.column_stack([normal[list(triple)], np.ones(3)])
         if abs(np.linalg.det(system)) > 1e-12:
@@ -84,7 +84,7 @@ def least_violation(lines, limit):
 
 
 def solve(lines, opt, direction_opt=False):
-    """The second program's (failed row, velocity)."""
+    """The second program's (failed line, velocity)."""
     return second_program(lines, opt, direction_opt, PARAMS)
 
 
@@ -93,7 +93,7 @@ def relax(lines, failed, v):
     return third_program(lines, failed, v, PARAMS)
 
 
-def test_second_program_finds_the_nearest_permitted_velocity():
+def test_second_program_finds_the_closest_permitted_velocity():
     rng = np.random.default_rng(0)
     feasible, borderline = 0, 0
     for _ in range(300):
@@ -107,11 +107,11 @@ def test_second_program_finds_the_nearest_permitted_velocity():
         assert (failed == len(lines)) == (margin > 0)
         if margin > 0:
             feasible += 1
-            np.testing.assert_allclose(v, nearest_permitted(lines, LIMIT, opt), atol=ATOL)
+            np.testing.assert_allclose(v, closest_permitted(lines, LIMIT, opt), atol=ATOL)
     assert 60 < feasible < 250 and borderline < 5
 
 
-def test_a_failed_row_is_the_first_that_empties_the_set():
+def test_the_failed_line_is_the_first_that_makes_the_program_infeasible():
     rng = np.random.default_rng(1)
     failures = 0
     for _ in range(300):
@@ -122,11 +122,11 @@ def test_a_failed_row_is_the_first_that_empties_the_set():
         failures += 1
         assert least_violation(lines[: failed + 1], LIMIT) > 0
         if failed > 0:
-            np.testing.assert_allclose(v, nearest_permitted(lines[:failed], LIMIT, opt), atol=ATOL)
+            np.testing.assert_allclose(v, closest_permitted(lines[:failed], LIMIT, opt), atol=ATOL)
     assert failures > 100
 
 
-def test_direction_goal_finds_the_farthest_permitted_velocity():
+def test_direction_optimisation_finds_the_farthest_permitted_velocity():
     rng = np.random.default_rng(2)
     feasible = 0
     for _ in range(300):
@@ -136,13 +136,13 @@ def test_direction_goal_finds_the_farthest_permitted_velocity():
         if failed < len(lines):
             continue
         feasible += 1
-        far = nearest_permitted(lines, LIMIT, 1e4 * direction)  # nearest to a point far out
+        far = closest_permitted(lines, LIMIT, 1e4 * direction)  # the closest to a distant point
         assert direction @ v == pytest.approx(direction @ far, abs=1e-3)
         assert violation(lines, v) < ATOL and np.linalg.norm(v) < LIMIT + ATOL
     assert feasible > 100
 
 
-def test_third_program_violates_the_worst_half_plane_least():
+def test_third_program_minimises_the_largest_violation():
     rng = np.random.default_rng(3)
     infeasible = 0
     for _ in range(300):
@@ -182,7 +182,7 @@ def test_both_programs_agree_with_slsqp():
     assert min(counts) > 15
 
 
-def test_antiparallel_half_planes_that_exclude_each_other_meet_halfway():
+def test_antiparallel_half_planes_without_a_common_point_are_violated_equally():
     lines = np.array([[0.0, -0.6, -1.0, 0.0], [0.0, 0.2, 1.0, 0.0]])  # y <= -0.6 and y >= 0.2
     failed, v = solve(lines, np.array([0.3, 0.9]))
     assert failed == 1
@@ -191,7 +191,7 @@ def test_antiparallel_half_planes_that_exclude_each_other_meet_halfway():
 
 
 @pytest.mark.parametrize("copies", [2, 5])
-def test_equal_half_planes_count_once(copies):
+def test_copies_of_a_half_plane_change_nothing(copies):
     lines = np.tile([[0.0, 0.5, 1.0, 0.0]], (copies, 1))  # y >= 0.5
     failed, v = solve(lines, np.array([0.1, -1.0]))
     assert failed == copies
@@ -205,9 +205,9 @@ def test_a_half_plane_outside_the_speed_disc_is_violated_least():
     np.testing.assert_allclose(relax(lines, failed, v), [0.0, LIMIT], atol=1e-9)
 
 
-@pytest.mark.parametrize("turn", [1e-7, 1e-6, 1e-4])
-def test_nearly_parallel_half_planes_stay_finite(turn):
-    lines = np.array([[0.0, 0.9, 1.0, 0.0], [0.0, -0.9, -np.cos(turn), np.sin(turn)], [0.0, 0.91, 1.0, turn]])
+@pytest.mark.parametrize("angle", [1e-7, 1e-6, 1e-4])
+def test_velocities_of_nearly_parallel_half_planes_are_finite(angle):
+    lines = np.array([[0.0, 0.9, 1.0, 0.0], [0.0, -0.9, -np.cos(angle), np.sin(angle)], [0.0, 0.91, 1.0, angle]])
     failed, v = solve(lines, np.array([0.0, 0.0]))
     assert failed < 3
     v = relax(lines, failed, v)

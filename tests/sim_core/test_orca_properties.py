@@ -1,9 +1,9 @@
-"""What one step of ORCA may not depend on: numbering, place, direction, handedness, units, robots out of reach.
+"""Invariances of one step of ORCA: numbering, translation, rotation, reflection, units, robots out of range.
 
-Numbering, units and far robots change no rounding, so that float32 results must stay bit for bit. Turning a
-scene rounds every number anew; where half-planes are nearly parallel ORCA magnifies that a million times and
-more. Scenes are therefore turned in float64, where it stays small, and robots are left out where the turn
-itself decides who is a neighbour (two equally near, or one at the edge of the range).
+Numbering, units and robots out of range change no rounding, so float32 results must be equal bit for bit. A rotation
+rounds every number anew, and ORCA amplifies rounding errors a million times and more where half-planes are almost
+parallel. Scenes are therefore rotated in float64, where the errors stay small. Robots are left out if rounding decides
+who their neighbours are (two equally near, or one at the edge of the range).
 """
 
 import numpy as np
@@ -28,8 +28,8 @@ SIZES = st.integers(2, 80)
 STRICT = settings(max_examples=100, deadline=None, derandomize=True)
 
 
-def turned(scene, angle, mirrored, shift_m):
-    """The scene in float64, mirrored at the x axis if asked, turned and shifted, and the matrix that does it."""
+def moved_scene(scene, angle, mirrored, shift_m):
+    """(scene, matrix): the scene in float64, reflected at the x axis if `mirrored`, rotated and shifted."""
     cos, sin = np.cos(angle), np.sin(angle)
     matrix = np.array([[cos, -sin], [sin, cos]]) @ np.diag([1.0, -1.0 if mirrored else 1.0])
     pos, vel, pref = (array.astype(np.float64) @ matrix.T for array in scene)
@@ -37,7 +37,7 @@ def turned(scene, angle, mirrored, shift_m):
 
 
 def clear_of_edges(scene, margin_sq=1e-9):
-    """Robots whose neighbours are the same ones in the same order after moves of `margin_sq`, m^2."""
+    """Mask of the robots whose neighbour lists do not change if squared distances change by `margin_sq`, m^2."""
     pos = scene.pos.astype(np.float64)
     return (tie_margin_sq(pos) > margin_sq) & (range_margin_sq(pos) > margin_sq)
 
@@ -62,20 +62,20 @@ def test_another_numbering_permutes_the_velocities(kind, number, n, order_seed):
     mirrored=st.booleans(),
     shift_m=st.tuples(st.floats(-100, 100), st.floats(-100, 100)),
 )
-def test_a_turned_mirrored_and_shifted_scene_gives_the_same_velocities(kind, number, n, angle, mirrored, shift_m):
+def test_a_rotated_reflected_and_shifted_scene_gives_the_same_velocities(kind, number, n, angle, mirrored, shift_m):
     scene = numbered_scene(kind, number, n)
-    moved, matrix = turned(scene, angle, mirrored, shift_m)
+    moved, matrix = moved_scene(scene, angle, mirrored, shift_m)
     new = orca_velocities(*scene, real=np.float64)
     error = np.abs(orca_velocities(*moved, real=np.float64) - new @ matrix.T)[clear_of_edges(scene)]
-    assert error.max(initial=0) < 1e-5  # largest of 85,000 robots: 4e-7
+    assert error.max(initial=0) < 1e-5  # the largest of 85,000 robots is 4e-7
 
 
 @pytest.mark.parametrize("kind", GENERIC_KINDS)
-def test_turning_a_scene_changes_next_to_nothing_for_nearly_all(kind):
+def test_a_rotation_changes_almost_nothing_for_almost_all_robots(kind):
     rng, errors = np.random.default_rng(0), []
     for number in range(60):
         scene = numbered_scene(kind, number)
-        moved, matrix = turned(scene, rng.uniform(-np.pi, np.pi), bool(number % 2), rng.uniform(-100, 100, 2))
+        moved, matrix = moved_scene(scene, rng.uniform(-np.pi, np.pi), bool(number % 2), rng.uniform(-100, 100, 2))
         new = orca_velocities(*scene, real=np.float64)
         error = np.abs(orca_velocities(*moved, real=np.float64) - new @ matrix.T)
         errors.append(error[clear_of_edges(scene)].max(axis=1))
@@ -87,7 +87,7 @@ def test_turning_a_scene_changes_next_to_nothing_for_nearly_all(kind):
 @STRICT
 @given(kind=st.sampled_from(KINDS), number=NUMBERS, n=SIZES, length=st.integers(-6, 6), time=st.integers(-4, 4))
 def test_units_do_not_matter(kind, number, n, length, time):
-    """Lengths and times in units that are a power of two of the metre and the second."""
+    """Units of length and time are the metre and the second times powers of two."""
     metre, second = 2.0**length, 2.0**time
     pos, vel, pref = numbered_scene(kind, number, n)
     new = orca_velocities(pos, vel, pref)
@@ -105,23 +105,23 @@ def test_units_do_not_matter(kind, number, n, length, time):
 
 
 @STRICT
-@given(kind=st.sampled_from(KINDS), number=NUMBERS, n=SIZES, strangers=st.integers(1, 40))
-def test_robots_out_of_range_change_nothing(kind, number, n, strangers):
-    scene, far = numbered_scene(kind, number, n), numbered_scene("jammed", number, strangers)
+@given(kind=st.sampled_from(KINDS), number=NUMBERS, n=SIZES, num_far=st.integers(1, 40))
+def test_robots_out_of_range_change_nothing(kind, number, n, num_far):
+    scene, far = numbered_scene(kind, number, n), numbered_scene("jammed", number, num_far)
     far = far._replace(pos=far.pos + np.float32(1e4))
     both = Scene(*(np.concatenate(arrays) for arrays in zip(scene, far, strict=True)))
     np.testing.assert_array_equal(orca_velocities(*both)[:n], orca_velocities(*scene))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_only_its_neighbours_have_a_say(kind):
-    """A robot among its neighbours alone, who want something else now, decides as in the whole scene."""
+def test_only_neighbours_and_not_their_preferences_matter(kind):
+    """With its neighbours alone, and other preferred velocities of theirs, a robot moves as in the whole scene."""
     rng = np.random.default_rng(0)
     for number in range(30):
         scene = numbered_scene(kind, number, int(rng.integers(20, 60)))
         nearest, new = np.argsort(distances_sq(scene.pos), axis=1, kind="stable"), orca_velocities(*scene)
         for robot in range(len(new)):
-            kept = np.sort([robot, *nearest[robot, :10]])  # in order, as ties go by number
+            kept = np.sort([robot, *nearest[robot, :10]])  # sorted, as ties are ordered by index
             pref = np.where(kept[:, None] == robot, scene.pref[kept], rng.normal(0, 1, (len(kept), 2)))
             alone = orca_velocities(scene.pos[kept], scene.vel[kept], pref)
             np.testing.assert_array_equal(alone[kept == robot][0], new[robot])

@@ -1,8 +1,8 @@
-"""What float32 costs: bounds for most robots, as ORCA has no bound for all.
+"""Accuracy of float32: bounds for most robots, because ORCA has no bound for all.
 
-Where half-planes are nearly parallel, a rounding error turns the velocity that violates them least; RVO2's own
-float32 results are as far off there. In jams that spread doubles every few steps, so that no two arithmetics
-stay together for long. `tests.benchmarks.exactness` prints the whole distribution.
+Where half-planes are almost parallel, a rounding error can rotate the velocity that violates them least by any angle.
+RVO2's own float32 results have the same errors there. In jams the difference doubles every few steps, so trajectories
+of two precisions diverge soon. `tests.benchmarks.exactness` prints the whole distribution.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from tests.sim_core.precision import drifts, one_step_difference
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_float32_is_one_step_from_float64_up_to_rounding_for_most(kind):
+def test_one_step_in_float32_equals_float64_up_to_rounding_for_most_robots(kind):
     errors = np.concatenate([one_step_difference(numbered_scene(kind, number)) for number in range(60)])
     assert len(errors) > 2000
     assert np.median(errors) < 3e-6 and np.quantile(errors, 0.9) < 1e-4

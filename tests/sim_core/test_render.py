@@ -1,4 +1,4 @@
-"""The rasteriser against what the picture must show: colours at known points, centroids, the view's orientation."""
+"""The rasteriser against the expected image: colours at known points, centroids, orientation of the view."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def pixel(image: np.ndarray, point_m: tuple[float, float], config: WorldConfig =
 
 
 def centroid(image: np.ndarray, near_m: tuple[float, float], half_px: int = 12) -> np.ndarray:
-    """Centre (column, row) of what is not white around a point."""
+    """Centroid (column, row) of the pixels around a point that are not white."""
     column, row = to_pixels(near_m, CONFIG, image.shape[0]).astype(int)
     window = image[row - half_px : row + half_px + 1, column - half_px : column + half_px + 1]
     ink = (255.0 - window).sum(axis=-1)
@@ -44,7 +44,7 @@ def test_robots_have_their_groups_colour_and_the_learning_robot_is_black():
         assert pixel(image, tuple(point)) == expected, robot
 
 
-def test_learning_robot_wears_a_ring_of_its_groups_colour():
+def test_learning_robot_has_a_ring_in_its_groups_colour():
     image = draw_world(POSITION, GOAL, LEARNER, CONFIG, size_px=960)
     column, row = to_pixels(POSITION[LEARNER], CONFIG, 960).astype(int)
     ring = image[row, column - 14 : column + 15]
@@ -60,8 +60,8 @@ def test_view_has_x_to_the_right_and_y_up():
     assert columns.max() < 240
 
 
-def test_discs_are_centred_between_pixels():
-    """A shift of a fraction of a pixel shifts the picture by as much: edges are antialiased."""
+def test_discs_are_centred_with_subpixel_accuracy():
+    """Edges are antialiased: a shift by a fraction of a pixel shifts the centroid as much."""
     px_m = 2 * view_half_m(CONFIG) / 480
     for shift_px in (0.0, 0.25, 0.5, 0.8):
         position = POSITION.astype(np.float64) + (shift_px * px_m, 0.0)
@@ -85,7 +85,7 @@ def test_small_robots_stay_visible():
     assert pixel(image, (-2.0, 3.0)) == colour_rgb(GROUP_COLOURS[0]).tolist()
 
 
-def test_goals_are_hollow_squares_and_the_learning_robots_is_edged_in_black():
+def test_goals_are_hollow_squares_and_the_learning_robots_goal_has_a_black_outline():
     image = draw_world(POSITION, GOAL, LEARNER, CONFIG)
     for group, (x, y) in enumerate(GOAL):
         assert pixel(image, (x, y)) == [255, 255, 255]
@@ -95,14 +95,14 @@ def test_goals_are_hollow_squares_and_the_learning_robots_is_edged_in_black():
         assert (edge == 0).all(axis=-1).any() == (group == 1)
 
 
-def test_sensing_disc_is_shaded_out_to_its_radius():
+def test_sensing_disc_is_shaded_up_to_its_radius():
     image = draw_world(POSITION, GOAL, LEARNER, CONFIG)
     inside, outside = pixel(image, (0.0, -3.0 + 1.4)), pixel(image, (0.0, -3.0 + 1.62))
     assert outside == [255, 255, 255]
     assert 200 < min(inside) and max(inside) < 250
 
 
-def test_robots_outside_the_view_are_cut_off():
+def test_robots_outside_the_view_are_clipped():
     far = POSITION.copy()
     far[:3] = 1e6
     far[LEARNER] = [view_half_m(CONFIG), 0.0]
@@ -120,7 +120,7 @@ def test_order_of_a_groups_robots_does_not_matter():
     assert np.abs(one - other).max() <= 1
 
 
-def test_drawing_leaves_no_trace_in_the_next_image():
+def test_images_do_not_depend_on_earlier_ones():
     first = draw_world(POSITION, GOAL, LEARNER, CONFIG)
     draw_world(POSITION + 0.5, GOAL, 0, CONFIG)
     np.testing.assert_array_equal(draw_world(POSITION, GOAL, LEARNER, CONFIG), first)

@@ -7,7 +7,7 @@ from sim_core.segregation import mean_goal_distance_m, mean_pairwise_distances_m
 
 
 def naive_mean_distance(first, second):
-    """Eq. 3.1, word for word."""
+    """Eq. 3.1, literally."""
     return sum(sum(np.hypot(*(p - q)) for q in second) / len(second) for p in first) / len(first)
 
 
@@ -32,12 +32,12 @@ def test_equations_match_naive_loops(groups):
 def test_a_single_scene_needs_no_batch_axis():
     pos = np.array([[0.0, 0.0], [0.0, 1.0], [5.0, 0.0], [5.0, 1.0]])
     assert segregated_fraction(pos, 2) == 1.0
-    np.testing.assert_allclose(mean_pairwise_distances_m(pos, 2)[0, 0], 0.5)  # zero distances count
+    np.testing.assert_allclose(mean_pairwise_distances_m(pos, 2)[0, 0], 0.5)  # zero distances to oneself count
 
 
-def test_equation_3_1_cannot_tell_mixed_groups_of_equal_spread():
-    # With i = j counted, 2 d_XY - d_XX - d_YY is the energy distance (Szekely & Rizzo), never negative: of two
-    # groups at most one can be wider than their distance, and groups of equal spread pass wherever they are.
+def test_equation_3_1_counts_mixed_groups_of_equal_spread_as_segregated():
+    # With i = j counted, 2 d_XY - d_XX - d_YY is the energy distance (Szekely & Rizzo) and never negative. So d_XX
+    # or d_YY is at most d_XY, and groups of equal spread count as segregated at any positions.
     rng = np.random.default_rng(0)
     for _ in range(200):
         mean = mean_pairwise_distances_m(rng.normal(0, 1, (20, 2)) * rng.uniform(0.5, 2, (20, 1)), 2)
@@ -61,15 +61,15 @@ def test_without_self_distances_mixed_groups_are_not_segregated():
     assert np.isnan(mean_pairwise_distances_m(pos[:, :2], 2, count_self=False)[:, 0, 0]).all()
 
 
-def test_self_distances_of_the_equation_favour_small_groups():
-    # Eq. 3.1 as printed counts i = j: two robots of each group, wholly mixed, still pass (see the docstring).
+def test_self_distances_make_small_mixed_groups_count_as_segregated():
+    # Eq. 3.1 as printed counts i = j: two fully mixed groups of two robots still count as segregated.
     square = np.array([[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
     assert mean_pairwise_distances_m(square, 2)[0, 0] == pytest.approx(np.sqrt(2) / 2)
     assert segregated_fraction(square, 2) == 1.0
 
 
 def test_a_wide_group_around_a_tight_one_fails_on_one_side_only():
-    # d_XX < d_XY holds for the tight group alone: both conditions are needed.
+    # d_XX < d_XY holds for the tight group only, so both conditions are needed.
     angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
     tight, wide = 0.01 * np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([np.cos(angle), np.sin(angle)], 1)
     pos = np.concatenate([tight, 5 * wide])
@@ -78,14 +78,14 @@ def test_a_wide_group_around_a_tight_one_fails_on_one_side_only():
     assert segregated_fraction(pos, 2) == 0.0 and segregated_fraction(pos[::-1], 2) == 0.0
 
 
-def test_groups_are_blocks_of_robots_not_strides():
+def test_groups_are_contiguous_blocks_of_robots():
     pos = np.array([[0.0, 0.0], [0.1, 0.0], [9.0, 0.0], [9.1, 0.0]])
     assert mean_pairwise_distances_m(pos, 2)[0, 0] == pytest.approx(0.05)
     assert mean_pairwise_distances_m(pos[[0, 2, 1, 3]], 2)[0, 0] == pytest.approx(4.5)
 
 
-def test_three_groups_count_pairs():
+def test_the_fraction_of_three_groups_counts_pairs():
     line = np.stack([np.linspace(0, 1, 6), np.zeros(6)], axis=1)
-    side = 3 * line + [[-1, 0.01]]  # wider than its distance to the first
+    side = 3 * line + [[-1, 0.01]]  # its spread exceeds its distance to the first group
     pos = np.concatenate([line, side, line + 9])
     assert segregated_fraction(pos, 3) == pytest.approx(2 / 3)

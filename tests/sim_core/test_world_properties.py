@@ -1,4 +1,4 @@
-"""Worlds of a batch never influence each other, nor does a learning robot that the swarm does not know."""
+"""Worlds of a batch are independent, and the swarm is independent of a learning robot that it does not know."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sim_core.config import WorldConfig
 from sim_core.worlds import WorldBatch
 
-STEPS, MOST_WORLDS = 50, 17
+STEPS, MAX_WORLDS = 50, 17
 SETUPS = {  # robots, groups, arena radius (m; small, so that groups meet soon), whether the swarm knows the learner
     "5r×1g": (5, 1, 1.5, True),
     "5r×3g": (5, 3, 1.2, False),
@@ -18,7 +18,7 @@ SETUPS = {  # robots, groups, arena radius (m; small, so that groups meet soon),
 
 
 def batch(name, seeds):
-    """A freshly reset batch of one world a seed."""
+    """A freshly reset batch with one world per seed."""
     robots, groups, arena_radius_m, knows = SETUPS[name]
     known = "yes" if knows else "no"
     config = WorldConfig(robots=robots, groups=groups, arena_radius_m=arena_radius_m, swarm_knows_learner=known)
@@ -29,7 +29,7 @@ def batch(name, seeds):
 
 
 def plan(seeds):
-    """One (actions or None, worlds to restart before the step) a step; each world's part depends on its seed alone."""
+    """Yields per step (actions or None, worlds to restart before it); a world's entries depend on its seed alone."""
     actions = np.stack([np.random.default_rng(seed).integers(0, 8, STEPS) for seed in seeds], axis=1)
     for step in range(STEPS):
         restarts = np.array([(3 * step + 5 * seed) % 23 == 0 for seed in seeds])
@@ -37,7 +37,7 @@ def plan(seeds):
 
 
 def records(worlds, seeds):
-    """By name, everything that a run of the plan shows, `[STEPS, num_worlds, ...]`."""
+    """All results and states of the plan's steps by name, `[STEPS, num_worlds, ...]`."""
     found = []
     for action, restarts in plan(seeds):
         if restarts.any():
@@ -48,11 +48,11 @@ def records(worlds, seeds):
 
 @pytest.mark.parametrize("name", SETUPS)
 def test_batches_of_every_size_equal_their_worlds_one_by_one(name):
-    seeds = list(range(MOST_WORLDS))
+    seeds = list(range(MAX_WORLDS))
     alone = [records(batch(name, [seed]), [seed]) for seed in seeds]
-    assert len({one["pos_x"].tobytes() for one in alone}) == MOST_WORLDS
-    assert any((np.diff(one["steps"][:, 0]) < 1).any() for one in alone)  # some did restart
-    for num_worlds in range(1, MOST_WORLDS + 1):
+    assert len({one["pos_x"].tobytes() for one in alone}) == MAX_WORLDS
+    assert any((np.diff(one["steps"][:, 0]) < 1).any() for one in alone)  # some worlds did restart
+    for num_worlds in range(1, MAX_WORLDS + 1):
         some = seeds[-num_worlds:]
         together = records(batch(name, some), some)
         for i, seed in enumerate(some):
@@ -61,8 +61,8 @@ def test_batches_of_every_size_equal_their_worlds_one_by_one(name):
 
 
 @pytest.mark.parametrize("name", SETUPS)
-def test_groups_are_mixed_up_in_these_worlds(name):
-    """The batches above are a test of little if their robots do not meet."""
+def test_robots_of_these_worlds_meet(name):
+    """If they did not, the tests above would show little."""
     worlds = batch(name, list(range(4)))
     nearest_m = np.inf
     for _ in range(STEPS):
@@ -73,8 +73,8 @@ def test_groups_are_mixed_up_in_these_worlds(name):
     assert nearest_m < 0.4
 
 
-def somewhere(pos, learner, rng):
-    """A place for the learning robot of one world: upon, beside or far away from the others."""
+def random_position(pos, learner, rng):
+    """A position for the learning robot of one world: at, beside or far away from another robot."""
     if rng.random() < 0.3:
         return rng.uniform(-1e6, 1e6, 2)
     others = np.delete(pos, learner, axis=0)
@@ -83,22 +83,22 @@ def somewhere(pos, learner, rng):
 
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(robots=st.integers(2, 12), groups=st.integers(1, 4), num_worlds=st.integers(1, 9), seed=st.integers(0, 10**6))
-def test_wherever_an_unknown_learning_robot_is_put_nobody_else_changes(robots, groups, num_worlds, seed):
+def test_an_unknown_learning_robot_at_any_position_changes_no_other_robot(robots, groups, num_worlds, seed):
     config = WorldConfig(robots=robots, groups=groups, arena_radius_m=2.0, swarm_knows_learner="no")
-    calm, haunted = WorldBatch(config, num_worlds), WorldBatch(config, num_worlds)
-    for worlds in (calm, haunted):
+    plain, displaced = WorldBatch(config, num_worlds), WorldBatch(config, num_worlds)
+    for worlds in (plain, displaced):
         worlds.seed(list(range(seed, seed + num_worlds)))
         worlds.reset()
-    rng, rows, learner = np.random.default_rng(seed), np.arange(num_worlds), calm.get_state()["learner"]
+    rng, rows, learner = np.random.default_rng(seed), np.arange(num_worlds), plain.get_state()["learner"]
     others = np.arange(config.num_robots) != learner[:, None]
     for _ in range(30):
-        state, pos = haunted.get_state(), haunted.positions()
-        places = [somewhere(pos[w], learner[w], rng) for w in rows]
-        state["pos_x"][rows, learner], state["pos_y"][rows, learner] = np.transpose(places)
+        state, pos = displaced.get_state(), displaced.positions()
+        positions = [random_position(pos[w], learner[w], rng) for w in rows]
+        state["pos_x"][rows, learner], state["pos_y"][rows, learner] = np.transpose(positions)
         state["vel_x"][rows, learner], state["vel_y"][rows, learner] = rng.normal(0, 10, (2, num_worlds))
-        haunted.set_state(state)
-        calm.step(None), haunted.step(None)
-        expected, found = calm.get_state(), haunted.get_state()
+        displaced.set_state(state)
+        plain.step(None), displaced.step(None)
+        expected, found = plain.get_state(), displaced.get_state()
         np.testing.assert_array_equal(found["rng"], expected["rng"])
         for name in ("pos_x", "pos_y", "vel_x", "vel_y", "machine"):
             np.testing.assert_array_equal(found[name][others], expected[name][others], err_msg=name)

@@ -1,4 +1,4 @@
-"""Start scenes: geometry, uniformity (scipy) and the 25 setups of the dissertation."""
+"""Scenarios: geometry, uniformity (scipy) and the 25 setups of the dissertation."""
 
 import itertools
 import math
@@ -25,17 +25,17 @@ def start(num_worlds=WORLDS, **settings):
 
 
 def grid_coordinates(worlds):
-    """Start positions `[num_worlds, groups, robots, 2]`: along and across the line from goal to start centre."""
+    """Start positions `[num_worlds, groups, robots, 2]` along and across the line from the goal to the group centre."""
     config, goals = worlds.config, worlds.goals().astype(np.float64)
     along = -goals / config.arena_radius_m
     across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
     pos = worlds.positions().astype(np.float64).reshape(worlds.num_worlds, config.groups, config.robots, 2)
-    delta = pos + goals[:, :, None]  # the start centre is the goal's antipode
+    delta = pos + goals[:, :, None]  # the group centre is the goal's antipode
     return np.stack([(delta * along[:, :, None]).sum(-1), (delta * across[:, :, None]).sum(-1)], axis=-1)
 
 
 @pytest.mark.parametrize(("robots", "groups"), SETUPS)
-def test_setups_of_the_dissertation_start_apart_and_segregated(robots, groups):
+def test_setups_of_the_dissertation_start_segregated_and_without_collisions(robots, groups):
     worlds = start(robots=robots, groups=groups)
     assert min(pdist(pos).min() for pos in worlds.positions()) > 2 * worlds.config.robot_radius_m
     assert (segregated_fraction(worlds.positions(), groups) == 1).all()
@@ -44,7 +44,7 @@ def test_setups_of_the_dissertation_start_apart_and_segregated(robots, groups):
 
 
 @pytest.mark.parametrize(("robots", "groups"), [(5, 3), (10, 2), (25, 8)])
-def test_goals_lie_evenly_on_the_circle_opposite_the_starts(robots, groups):
+def test_goals_lie_evenly_on_the_circle_opposite_the_group_centres(robots, groups):
     worlds = start(robots=robots, groups=groups)
     goals = worlds.goals().astype(np.float64)
     np.testing.assert_allclose(np.linalg.norm(goals, axis=-1), worlds.config.arena_radius_m, rtol=1e-6)
@@ -67,7 +67,7 @@ def test_without_jitter_the_start_is_a_square_grid(robots):
     np.testing.assert_allclose(grid[0, 0].max(axis=0), -grid[0, 0].min(axis=0), atol=2e-6)  # centred
 
 
-def test_jitter_is_uniform_within_its_bounds_on_both_axes():
+def test_jitter_is_uniform_on_both_axes():
     settings = {"robots": 25, "groups": 4}
     plain = grid_coordinates(start(start_jitter_m=0.0, **settings))
     jitter = grid_coordinates(start(start_jitter_m=0.1, **settings)) - plain[:1]
@@ -88,7 +88,7 @@ def test_rotation_and_learning_robot_are_uniform_and_independent():
     assert stats.chi2_contingency(table).pvalue > 1e-3
 
 
-def test_episodes_of_one_world_differ_and_restart_by_mask_only():
+def test_episodes_of_a_world_differ_and_the_mask_selects_the_worlds_that_restart():
     worlds = start(num_worlds=3, robots=5, groups=2)
     for _ in range(3):
         worlds.step(np.zeros(3, np.int64))

@@ -1,7 +1,7 @@
-"""FL-ORCA's rules by hand: every state, term, weight and boundary of the published table.
+"""FL-ORCA's rules by hand: every state, term, weight and threshold of the published rules.
 
-Scenes lie around robot 0 of group 0 at the origin, whose goal is far along +x, so that the angle to the
-goal is the plain polar angle. Robots that a scene does not need stand far away from each other.
+In every scene robot 0 of group 0 stands at the origin and its goal lies far along +x, so that angles from the goal
+direction are polar angles. Robots that a scene does not need stand far away from all others.
 """
 
 import numpy as np
@@ -22,82 +22,82 @@ MATE, MATE_2, OTHER, OTHER_2, THIRD = 1, 2, 4, 5, 8
 
 
 def polar(distance_m, angle_deg):
-    """Position at an angle from the direction to the goal, anticlockwise."""
+    """Position at a distance and an anticlockwise angle from the goal direction."""
     return np.array([np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))]) * distance_m
 
 
-def place(**robots):
-    """Positions `[12, 2]`: robot 0 at the origin, those named where they are put, the rest far away."""
+def positions(**robots):
+    """Positions `[12, 2]`: robot 0 at the origin, named robots at the given positions, the others far away."""
     pos = np.stack([np.full(12, 100.0), 10.0 * np.arange(12)], axis=1)
     pos[0] = 0
-    for name, where in robots.items():
-        pos[globals()[name]] = where
+    for name, position in robots.items():
+        pos[globals()[name]] = position
     return pos
 
 
 def unit(vector):
-    """The vector, shortened to length 1 if longer."""
+    """The vector, scaled to length 1 if it is longer."""
     return np.asarray(vector) / max(1.0, np.linalg.norm(vector))
 
 
-RIGHT_Z = np.array([0.0, -20.0])  # the goal direction (20, 0) turned clockwise
+RIGHT_Z = np.array([0.0, -20.0])  # the goal direction (20, 0), rotated clockwise by 90 degrees
 
 
 def check(flock, state, total, leader=-1, robot=0):
-    """Robot `robot` is in `state`, follows `leader`, and prefers `total` set to length 1 if longer."""
+    """Robot `robot` is in `state`, follows `leader`, and prefers the velocity `total`, clipped to length 1."""
     assert flock.states[robot] == state
     assert (flock.leaders[robot] if flock.leaders[robot] >= 0 else -1) == leader
     np.testing.assert_allclose(flock.velocity[robot], unit(total), atol=2e-5)
 
 
-def test_alone_it_goes_to_the_goal(make_flock):
-    check(make_flock(CONFIG, place(), GOALS), SINGLE_GROUP, [1, 0])
+def test_a_robot_alone_goes_to_its_goal(make_flock):
+    check(make_flock(CONFIG, positions(), GOALS), SINGLE_GROUP, [1, 0])
 
 
 def test_single_group_adds_cohesion_and_alignment(make_flock):
     vel = np.zeros((12, 2))
     vel[MATE], vel[MATE_2] = (0.4, 0.8), (0.2, -0.2)
-    flock = make_flock(CONFIG, place(MATE=(-0.6, 0.8), MATE_2=(-0.2, 0.4)), GOALS, vel)
+    flock = make_flock(CONFIG, positions(MATE=(-0.6, 0.8), MATE_2=(-0.2, 0.4)), GOALS, vel)
     check(flock, SINGLE_GROUP, np.array([1, 0]) + [-0.4, 0.6] + [0.3, 0.3])
 
 
 def test_vision_free_weighs_all_terms(make_flock):
     vel = np.zeros((12, 2))
-    vel[MATE], vel[OTHER] = (0.0, 0.1), (-1, 0)  # another group's velocity must not count
+    vel[MATE], vel[OTHER] = (0.0, 0.1), (-1, 0)  # alignment must ignore another group
     mate, other = polar(0.02, 120), polar(0.3, 40)
-    flock = make_flock(CONFIG, place(MATE=mate, OTHER=other), GOALS, vel)
+    flock = make_flock(CONFIG, positions(MATE=mate, OTHER=other), GOALS, vel)
     check(flock, VISION_FREE, 15 * mate - 0.5 * other + 5 * np.array([0, 0.1]) + [0.35, 0])
 
 
 def test_vision_free_alone_is_shorter_than_full_speed(make_flock):
     other = polar(0.3, -40)
-    flock = make_flock(CONFIG, place(OTHER=other), GOALS)
+    flock = make_flock(CONFIG, positions(OTHER=other), GOALS)
     assert np.linalg.norm(flock.velocity[0]) < 0.4
     check(flock, VISION_FREE, [0.35, 0] - 0.5 * other)
 
 
 def test_follower_that_sees_another_group(make_flock):
-    # OTHER blocks the view, MATE beside it has a free one.
+    # OTHER blocks the view; MATE has a free view.
     mate, other = polar(0.1, 100), polar(0.3, -15)
-    flock = make_flock(CONFIG, place(MATE=mate, OTHER=other), GOALS)
+    flock = make_flock(CONFIG, positions(MATE=mate, OTHER=other), GOALS)
     check(flock, FOLLOWER, (15 + 50) * mate - 0.5 * other, leader=MATE)
 
 
-def test_follower_that_sees_none_goes_on_to_the_goal(make_flock):
-    mate = polar(1.0, 15)  # in the way, with a free view itself
-    flock = make_flock(CONFIG, place(MATE=mate), GOALS)
+def test_follower_that_sees_no_other_group_adds_the_goal(make_flock):
+    mate = polar(1.0, 15)  # blocks the view and has a free view itself
+    flock = make_flock(CONFIG, positions(MATE=mate), GOALS)
     check(flock, FOLLOWER, np.array([1, 0]) + (10 + 50) * mate, leader=MATE)
 
 
 def test_of_two_free_robots_the_one_nearer_the_goal_leads(make_flock):
-    near, far = polar(0.3, 100), polar(0.5, 60)  # MATE is the nearer neighbour, MATE_2 is nearer to the goal
-    flock = make_flock(CONFIG, place(MATE=near, MATE_2=far, OTHER=polar(0.9, -15)), GOALS)
+    near, far = polar(0.3, 100), polar(0.5, 60)  # MATE is nearer to robot 0, MATE_2 is nearer to the goal
+    flock = make_flock(CONFIG, positions(MATE=near, MATE_2=far, OTHER=polar(0.9, -15)), GOALS)
     check(flock, FOLLOWER, np.array([1, 0]) + 10 * (near + far) / 2 + 50 * far, leader=MATE_2)
 
 
-def test_second_level_follows_a_follower_and_third_does_not(make_flock):
-    # A queue along the line to the goal, 1 m apart: only the first has a free view; each senses the next.
-    pos = place(MATE=(1.0, 0), MATE_2=(2.0, 0))
+def test_a_level_2_follower_follows_a_follower_and_is_not_followed(make_flock):
+    # A queue towards the goal with 1 m gaps: only the first robot has a free view; each robot senses the next one.
+    pos = positions(MATE=(1.0, 0), MATE_2=(2.0, 0))
     pos[3] = (-1.0, 0)
     flock = make_flock(CONFIG, pos, GOALS)
     assert flock.leaders[:4].tolist() == [MATE, MATE_2, -1, -1]
@@ -107,54 +107,54 @@ def test_second_level_follows_a_follower_and_third_does_not(make_flock):
 
 
 def test_a_free_leader_is_preferred_to_a_follower_nearer_the_goal(make_flock):
-    # MATE_2 (free) stands behind; MATE, nearer to the goal, is itself a follower of robot 3.
-    pos = place(MATE=(1.2, 0.0), MATE_2=(-0.9, 1.0), OTHER=(1.3, 1.3), OTHER_2=(100, 300))
+    # MATE_2 has a free view and stands behind robot 0. MATE is nearer to the goal and follows robot 3.
+    pos = positions(MATE=(1.2, 0.0), MATE_2=(-0.9, 1.0), OTHER=(1.3, 1.3), OTHER_2=(100, 300))
     pos[3] = (2.4, 0.0)
     flock = make_flock(CONFIG, pos, GOALS)
     assert flock.leaders[MATE] == 3 and flock.states[MATE_2] in (SINGLE_GROUP, VISION_FREE)
     assert flock.leaders[0] == MATE_2
 
 
-def test_turn_right_by_its_own_sight(make_flock):
+def test_turn_right_because_the_robot_sees_another_group(make_flock):
     other = polar(0.3, 10)
-    flock = make_flock(CONFIG, place(OTHER=other), GOALS)
+    flock = make_flock(CONFIG, positions(OTHER=other), GOALS)
     check(flock, TURN_RIGHT, -0.5 * other + 15 * RIGHT_Z)
 
 
 def test_turn_right_weighs_cohesion_and_alignment(make_flock):
-    goals = [(1e-2, 0.0), *GOALS[1:]]  # z is as long as the goal is far: near the goal the other terms show
+    goals = [(1e-2, 0.0), *GOALS[1:]]  # z is as long as the goal distance: near the goal the other terms matter
     vel = np.zeros((12, 2))
     vel[MATE] = (0.3, 0.2)
     other, mate = polar(0.3, 10), np.array([-0.004, 0.002])
-    flock = make_flock(CONFIG, place(MATE=mate, OTHER=other), goals, vel)
+    flock = make_flock(CONFIG, positions(MATE=mate, OTHER=other), goals, vel)
     z = np.array([0, -1e-2])
     check(flock, TURN_RIGHT, 50 * mate - 0.5 * other + np.array([0.3, 0.2]) + 15 * z)
 
 
-def test_turn_right_by_a_neighbours_sight(make_flock):
-    # OTHER is out of robot 0's sight (0.789 m) but blocks its view; MATE sees it and is blocked too.
+def test_turn_right_because_a_flockmate_sees_another_group(make_flock):
+    # OTHER is out of robot 0's sight (0.789 m) but blocks its view. MATE's view is blocked too, and it sees OTHER_2.
     mate, other = polar(0.5, 30), polar(1.2, 12)
-    flock = make_flock(CONFIG, place(MATE=mate, OTHER=other, OTHER_2=mate + [0.7, 0]), GOALS)
+    flock = make_flock(CONFIG, positions(MATE=mate, OTHER=other, OTHER_2=mate + [0.7, 0]), GOALS)
     assert flock.states[MATE] == TURN_RIGHT and flock.leaders[MATE] == -1
     check(flock, TURN_RIGHT, np.array([1, 0]) + 15 * mate + 50 * RIGHT_Z)
 
 
-def test_blocked_without_leader_or_sight_is_single_group(make_flock):
-    flock = make_flock(CONFIG, place(OTHER=polar(1.2, 0)), GOALS)
+def test_blocked_without_leader_or_other_group_in_sight_is_single_group(make_flock):
+    flock = make_flock(CONFIG, positions(OTHER=polar(1.2, 0)), GOALS)
     check(flock, SINGLE_GROUP, [1, 0])
 
 
-def test_a_neighbour_of_another_group_neither_leads_nor_warns(make_flock):
-    # OTHER has a free view of its own goal and sees robot 0's group; neither concerns robot 0.
-    pos = place(OTHER=polar(1.2, 0), OTHER_2=polar(1.3, 5))
+def test_a_neighbour_of_another_group_is_no_leader_and_causes_no_right_turn(make_flock):
+    # OTHER has a free view of its own goal and sees robot 0's group. Both must not matter to robot 0.
+    pos = positions(OTHER=polar(1.2, 0), OTHER_2=polar(1.3, 5))
     check(make_flock(CONFIG, pos, GOALS), SINGLE_GROUP, [1, 0])
 
 
-def test_at_the_goal_with_a_coincident_robot_all_is_finite(make_flock):
+def test_velocities_are_finite_at_the_goal_beside_coincident_robots(make_flock):
     goals = [(0.0, 0.0), *GOALS[1:]]
     for rules in ("published", "uniform"):
         config = WorldConfig(robots=ROBOTS, groups=GROUPS, flocking=rules)
-        flock = make_flock(config, place(MATE=(0, 0), OTHER=(0, 0), OTHER_2=(0.1, 0)), goals)
+        flock = make_flock(config, positions(MATE=(0, 0), OTHER=(0, 0), OTHER_2=(0.1, 0)), goals)
         assert np.isfinite(flock.velocity).all()
         assert np.linalg.norm(flock.velocity, axis=1).max() < 1 + 1e-5
 
@@ -166,25 +166,25 @@ def test_at_the_goal_with_a_coincident_robot_all_is_finite(make_flock):
         (0.5, -89.9, True), (0.5, -90.1, False), (0.3, 180, False),
     ],
 )  # fmt: skip
-def test_edges_of_sight(distance_m, angle_deg, seen, make_flock):
-    where = polar(distance_m, angle_deg)
-    assert make_flock(CONFIG, place(OTHER=where), GOALS).states[0] == (VISION_FREE if seen else SINGLE_GROUP)
-    assert make_flock(CONFIG, place(MATE=where), GOALS).states[0] == SINGLE_GROUP  # only another group is seen
+def test_limits_of_sight(distance_m, angle_deg, seen, make_flock):
+    position = polar(distance_m, angle_deg)
+    assert make_flock(CONFIG, positions(OTHER=position), GOALS).states[0] == (VISION_FREE if seen else SINGLE_GROUP)
+    assert make_flock(CONFIG, positions(MATE=position), GOALS).states[0] == SINGLE_GROUP  # the own group does not count
 
 
 @pytest.mark.parametrize(
     ("distance_m", "angle_deg", "blocks"),
     [(1.4, 19.9, True), (1.4, 20.1, False), (1.4, -19.9, True), (1.4, -20.1, False), (1.49, 0, True), (1.51, 0, False)],
 )
-def test_edges_of_the_view(distance_m, angle_deg, blocks, make_flock):
-    flock = make_flock(CONFIG, place(MATE=polar(distance_m, angle_deg)), GOALS)
+def test_limits_of_the_view(distance_m, angle_deg, blocks, make_flock):
+    flock = make_flock(CONFIG, positions(MATE=polar(distance_m, angle_deg)), GOALS)
     assert flock.states[0] == (FOLLOWER if blocks else SINGLE_GROUP)
 
 
 @pytest.mark.parametrize(("distance_m", "blocks"), [(2.62, True), (2.64, False)])
-def test_the_view_range_binds_where_neighbours_reach_farther(distance_m, blocks, make_flock):
+def test_the_view_range_limits_the_view_if_the_neighbour_range_is_larger(distance_m, blocks, make_flock):
     config = WorldConfig(robots=ROBOTS, groups=GROUPS, neighbour_range_m=4.0)
-    flock = make_flock(config, place(MATE=(distance_m, 0)), GOALS)
+    flock = make_flock(config, positions(MATE=(distance_m, 0)), GOALS)
     assert flock.states[0] == (FOLLOWER if blocks else SINGLE_GROUP)
 
 
@@ -192,14 +192,14 @@ def test_the_view_range_binds_where_neighbours_reach_farther(distance_m, blocks,
     ("distance_m", "angle_deg", "acts"),
     [(0.394, 44.9, True), (0.396, 44.9, False), (0.394, 45.1, False), (0.3, -44.9, True), (0.3, -45.1, False)],
 )
-def test_edges_of_separation(distance_m, angle_deg, acts, make_flock):
+def test_limits_of_separation(distance_m, angle_deg, acts, make_flock):
     other = polar(distance_m, angle_deg)
-    flock = make_flock(CONFIG, place(OTHER=other), GOALS)
+    flock = make_flock(CONFIG, positions(OTHER=other), GOALS)
     check(flock, VISION_FREE, [0.35, 0] - 0.5 * other * acts)
 
 
 def terms_of(pos, vel=None, noise=0.0, config=CONFIG):
-    """Robot 0's (cohesion, separation, alignment), all others being its neighbours."""
+    """Robot 0's (cohesion, separation, alignment); all others are its neighbours."""
     vel = np.zeros((len(pos), 2)) if vel is None else vel
     return terms_of_robot_0(pos, vel, (20, 0), 1 + noise, flock_params(config, REAL), config.robots)
 
@@ -217,17 +217,17 @@ def test_terms_are_means_and_clipped():
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1, 0.2])
-def test_noise_is_a_gain_of_separation_alone(noise):
+def test_noise_is_a_gain_of_the_separation_term_only(noise):
     pos, vel = [(0, 0), (0.2, 0.3), (0, 0.1), (0.1, 0), (0.2, 0.1)], [(0.5, 0)] * 5
     plain, noisy = terms_of(pos, vel), terms_of(pos, vel, noise)
     np.testing.assert_allclose(noisy, plain * [[1], [1 + noise], [1]], atol=1e-6)
 
 
-def test_drawn_gains_are_uniform_between_1_and_1_2(make_flock):
+def test_random_gains_are_uniform_between_1_and_1_2(make_flock):
     config = WorldConfig(robots=ROBOTS, groups=GROUPS)
     other, gains = polar(0.3, 40), []
     for seed in range(400):
-        velocity = make_flock(config, place(OTHER=other), GOALS, seed=seed * 7919).velocity[0]
+        velocity = make_flock(config, positions(OTHER=other), GOALS, seed=seed * 7919).velocity[0]
         gain = (np.array([0.35, 0]) - velocity) / (0.5 * other)
         assert gain[0] == pytest.approx(gain[1], abs=1e-4)
         gains.append(gain[1])
@@ -254,7 +254,7 @@ UNIFORM = [
 
 @pytest.mark.parametrize(("state", "sees", "weights"), TABLE)
 def test_published_weights(state, sees, weights):
-    params, size = flock_params(CONFIG, REAL), REAL(1e-3)  # small: no sum is cut to length 1
+    params, size = flock_params(CONFIG, REAL), REAL(1e-3)  # small, so that no sum is clipped to length 1
     for term in range(3):
         terms = [REAL(0)] * 6
         terms[2 * term + 1] = size
@@ -277,11 +277,11 @@ def test_uniform_weights(state, sees, weights):
         terms[2 * term] = REAL(1e-3)
         x, y = weighted_sum_of(state, sees, terms, (0, 0), (0, 0), params)
         assert (x, y) == (pytest.approx(weights[term] * 1e-3), 0)
-    for goal_m, pref in ((5.0, 1.0), (0.25, 1.0), (0.1, 0.4), (0.0, 0.0)):  # slows down within 0.25 m
+    for goal_m, pref in ((5.0, 1.0), (0.25, 1.0), (0.1, 0.4), (0.0, 0.0)):  # robots slow down within 0.25 m
         x, y = weighted_sum_of(state, sees, zeros, (goal_m, 0), (0, 0), params)
         assert (x, y) == (pytest.approx(weights[3] * pref), pytest.approx(-weights[5] * pref))
     x, y = weighted_sum_of(state, sees, zeros, (0, 0), (0, 0.3), params)
-    assert (x, y) == (0, pytest.approx(weights[4]))  # the direction to the leader, however near
+    assert (x, y) == (0, pytest.approx(weights[4]))  # a unit vector to the leader at any distance
 
 
 @settings(max_examples=60, deadline=None)
@@ -292,15 +292,15 @@ def test_uniform_weights(state, sees, weights):
     st.sampled_from(["published", "uniform"]),
 )
 def test_the_order_of_robots_in_a_group_does_not_matter(make_flock, seed, first, second, rules):
-    # Two passes over the old state: nobody sees a flag of this step before another robot does.
+    # Flags are computed in passes over the old state, so all robots see the same flags.
     config = WorldConfig(robots=ROBOTS, groups=GROUPS, separation_noise=0.0, flocking=rules)
     rng = np.random.default_rng(seed)
     pos, vel = rng.uniform(-1, 1, (12, 2)), rng.normal(0, 0.5, (12, 2))
     order = np.array([*first, *(4 + np.array(second)), *range(8, 12)])
     plain = make_flock(config, pos, GOALS, vel)
-    mixed = make_flock(config, pos[order], GOALS, vel[order])
-    np.testing.assert_array_equal(mixed.velocity, plain.velocity[order])
-    np.testing.assert_array_equal(mixed.states, plain.states[order])
-    np.testing.assert_array_equal(mixed.flags, plain.flags[order])
-    leaders = np.where(mixed.leaders >= 0, order[mixed.leaders], -1)
+    permuted = make_flock(config, pos[order], GOALS, vel[order])
+    np.testing.assert_array_equal(permuted.velocity, plain.velocity[order])
+    np.testing.assert_array_equal(permuted.states, plain.states[order])
+    np.testing.assert_array_equal(permuted.flags, plain.flags[order])
+    leaders = np.where(permuted.leaders >= 0, order[permuted.leaders], -1)
     np.testing.assert_array_equal(leaders, plain.leaders[order])

@@ -1,7 +1,7 @@
-"""FL-ORCA's preferred velocities against the rules of the spec, written again in angles and sets.
+"""FL-ORCA's preferred velocities against an independent implementation of its rules.
 
-The oracle knows neither dot products nor flags nor passes: it asks for angles in degrees, and finds
-followers as sets. Scenes where a robot lies on an edge of some rule are left out.
+The oracle uses angles in degrees and sets of robots instead of dot products, flags and passes. Scenes with a robot at a
+threshold of some rule are left out.
 """
 
 import numpy as np
@@ -11,78 +11,79 @@ from sim_core.config import WorldConfig
 from sim_core.swarm.flock_rules import FOLLOWER, SINGLE_GROUP, TURN_RIGHT, VISION_FREE
 
 ROBOTS, GROUPS = 6, 3
-EDGE = 2e-4
+MARGIN = 2e-4
+"""A comparison of numbers that differ by no more than this is too close to call."""
 
 
 def unit(vector):
-    """The vector, shortened to length 1 if longer."""
+    """The vector, scaled to length 1 if it is longer."""
     return np.asarray(vector) / max(1.0, np.linalg.norm(vector))
 
 
 class Oracle:
-    """The rules for one scene in float64; `clear` is false once a comparison was too close to call."""
+    """The rules for one scene in float64; `clear` becomes false when a comparison is too close to call."""
 
     def __init__(self, config, pos, vel, goals):
         self.config, self.pos, self.vel = config, pos.astype(np.float64), vel.astype(np.float64)
         self.group = np.arange(len(pos)) // config.robots
         self.to_goal = np.asarray(goals, np.float64)[self.group] - self.pos
         self.clear = True
-        everyone = range(len(pos))
-        self.near = [self.neighbours(i) for i in everyone]
-        self.mates = [[j for j in self.near[i] if self.group[j] == self.group[i]] for i in everyone]
-        self.foes = [[j for j in self.near[i] if self.group[j] != self.group[i]] for i in everyone]
+        robots = range(len(pos))
+        self.neighbours = [self.find_neighbours(i) for i in robots]
+        self.flockmates = [[j for j in self.neighbours[i] if self.group[j] == self.group[i]] for i in robots]
+        self.others = [[j for j in self.neighbours[i] if self.group[j] != self.group[i]] for i in robots]
         blocked = self.blocked_published if config.flocking == "published" else self.blocked_uniform
-        self.sees = {i for i in everyone if self.sees_other_group(i)}
-        self.free = {i for i in everyone if not blocked(i)}
-        self.level_1 = {i for i in everyone if i not in self.free and self.free & set(self.mates[i])}
-        self.level_2 = {i for i in set(everyone) - self.free - self.level_1 if self.level_1 & set(self.mates[i])}
+        self.sees = {i for i in robots if self.sees_other_group(i)}
+        self.free = {i for i in robots if not blocked(i)}
+        self.level_1 = {i for i in robots if i not in self.free and self.free & set(self.flockmates[i])}
+        self.level_2 = {i for i in set(robots) - self.free - self.level_1 if self.level_1 & set(self.flockmates[i])}
         self.followers = self.level_1 | self.level_2
 
     def less(self, value, limit):
-        """value < limit, noting how close it was."""
-        self.clear &= abs(value - limit) > EDGE
+        """value < limit; `clear` becomes false if that is too close to call."""
+        self.clear &= abs(value - limit) > MARGIN
         return value < limit
 
     def distance(self, i, j):
         return np.hypot(*(self.pos[j] - self.pos[i]))
 
     def angle(self, i, j):
-        """Degrees between the directions to j and to the goal."""
+        """The angle between the directions to j and to the goal, degrees."""
         a, b = (np.degrees(np.arctan2(v[1], v[0])) for v in (self.pos[j] - self.pos[i], self.to_goal[i]))
         return abs((a - b + 180) % 360 - 180)
 
-    def neighbours(self, i):
+    def find_neighbours(self, i):
         others = sorted((self.distance(i, j), j) for j in range(len(self.pos)) if j != i)
-        close = [(d, j) for d, j in others if self.less(d, self.config.neighbour_range_m)]
-        cut = self.config.max_neighbours
-        self.clear &= len(close) <= cut or close[cut][0] - close[cut - 1][0] > EDGE
-        return [j for _, j in close[:cut]]
+        in_range = [(d, j) for d, j in others if self.less(d, self.config.neighbour_range_m)]
+        k = self.config.max_neighbours
+        self.clear &= len(in_range) <= k or in_range[k][0] - in_range[k - 1][0] > MARGIN
+        return [j for _, j in in_range[:k]]
 
     def sees_other_group(self, i):
         c = self.config
         seen = [self.less(self.distance(i, j), c.sight_range_m) & self.less(self.angle(i, j), c.sight_angle_deg)
-                for j in self.foes[i]]  # fmt: skip
+                for j in self.others[i]]  # fmt: skip
         return any(seen)
 
     def blocked_published(self, i):
         c = self.config
-        ways = [self.less(self.distance(i, j), c.view_range_m) & self.less(self.angle(i, j), c.view_angle_deg)
-                for j in self.near[i]]  # fmt: skip
-        return any(ways)
+        blocks = [self.less(self.distance(i, j), c.view_range_m) & self.less(self.angle(i, j), c.view_angle_deg)
+                for j in self.neighbours[i]]  # fmt: skip
+        return any(blocks)
 
     def blocked_uniform(self, i):
         goal_m = np.hypot(*self.to_goal[i])
-        ways = []
-        for j in self.foes[i]:
-            turn, dist = np.radians(self.angle(i, j)), self.distance(i, j)
-            ahead = self.less(0, dist * np.cos(turn)) & self.less(dist * np.cos(turn), goal_m)
-            ways.append(ahead & self.less(dist * np.sin(turn), self.config.uniform_view_corridor_m))
-        return any(ways)
+        blocks = []
+        for j in self.others[i]:
+            angle, dist = np.radians(self.angle(i, j)), self.distance(i, j)
+            ahead = self.less(0, dist * np.cos(angle)) & self.less(dist * np.cos(angle), goal_m)
+            blocks.append(ahead & self.less(dist * np.sin(angle), self.config.uniform_view_corridor_m))
+        return any(blocks)
 
     def leader(self, i):
         wanted = self.free if i in self.level_1 else self.level_1
-        candidates = sorted((np.hypot(*self.to_goal[j]), j) for j in self.mates[i] if j in wanted)
-        self.clear &= len(candidates) < 2 or candidates[1][0] - candidates[0][0] > EDGE
+        candidates = sorted((np.hypot(*self.to_goal[j]), j) for j in self.flockmates[i] if j in wanted)
+        self.clear &= len(candidates) < 2 or candidates[1][0] - candidates[0][0] > MARGIN
         return candidates[0][1]
 
     def state(self, i):
@@ -90,25 +91,25 @@ class Oracle:
             return VISION_FREE if i in self.sees else SINGLE_GROUP
         if i in self.followers:
             return FOLLOWER
-        warned = i in self.sees or any(j in self.sees and j not in self.followers for j in self.mates[i])
+        warned = i in self.sees or any(j in self.sees and j not in self.followers for j in self.flockmates[i])
         return TURN_RIGHT if warned else SINGLE_GROUP
 
     def separation(self, i):
         c = self.config
         if c.flocking == "published":
-            near = [j for j in self.foes[i] if self.less(self.distance(i, j), c.separation_range_m)
+            near = [j for j in self.others[i] if self.less(self.distance(i, j), c.separation_range_m)
                     & self.less(self.angle(i, j), c.separation_angle_deg)]  # fmt: skip
             return -unit(np.mean(self.pos[near] - self.pos[i], axis=0)) if near else np.zeros(2)
         total, reach = np.zeros(2), c.uniform_separation_range_m
-        for j in self.near[i]:
+        for j in self.neighbours[i]:
             away, dist = self.pos[i] - self.pos[j], self.distance(i, j)
             total += away / dist * max(0, 1 - dist / reach)
         return unit(total)
 
     def velocity(self, i):
-        mates, state, sees = self.mates[i], self.state(i), i in self.sees
-        v1 = unit(self.pos[mates].mean(axis=0) - self.pos[i]) if mates else np.zeros(2)
-        v3 = unit(self.vel[mates].mean(axis=0)) if mates else np.zeros(2)
+        flockmates, state, sees = self.flockmates[i], self.state(i), i in self.sees
+        v1 = unit(self.pos[flockmates].mean(axis=0) - self.pos[i]) if flockmates else np.zeros(2)
+        v3 = unit(self.vel[flockmates].mean(axis=0)) if flockmates else np.zeros(2)
         v2, z = self.separation(i), np.array([self.to_goal[i][1], -self.to_goal[i][0]])
         to_leader = self.pos[self.leader(i)] - self.pos[i] if state == FOLLOWER else np.zeros(2)
         if self.config.flocking == "uniform":
@@ -124,7 +125,7 @@ class Oracle:
             (TURN_RIGHT, False): pref + 15 * v1 + 2 * v3 + 50 * z,
             (SINGLE_GROUP, False): pref + v1 + v3,
         }[state, sees]
-        self.clear &= np.linalg.norm(total) > 1e-2  # else rounding turns the direction
+        self.clear &= np.linalg.norm(total) > 1e-2  # the direction of a shorter sum depends on rounding
         return unit(total)
 
 
@@ -148,4 +149,4 @@ def test_random_scenes_match_the_rules(rules, make_flock):
         compared += 1
         states += np.bincount(flock.states, minlength=4)
     assert compared > 40
-    assert states.min() > 15  # every state of Figure 2.2 was met
+    assert states.min() > 15  # every state of Figure 2.2 occurs

@@ -1,4 +1,4 @@
-"""The grid changes how far a search has to look, never what it finds: equal results with and without, bit for bit."""
+"""The grid makes the neighbour search faster and never changes its result: with and without are equal bit for bit."""
 
 import math
 
@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from sim_core.config import WorldConfig
 from sim_core.lanes import LANES
-from sim_core.swarm import step, tile
+from sim_core.swarm import step
+from sim_core.swarm import tile as tile_module
 from sim_core.swarm.grid import ROW_SPAN_CELLS
 from sim_core.worlds import WorldBatch
 from tests.sim_core.kernels import cell_list, orca_step
@@ -39,17 +40,17 @@ def _coincident(n, rng):
 
 
 def _lattice(n, rng):
-    """Exact ties everywhere, robots exactly as far as the range, and on the cells' edges."""
+    """Exact ties everywhere, robots at exactly the range's distance, and robots on the cells' edges."""
     side = math.isqrt(n) + 1
     return 0.25 * np.stack(np.divmod(rng.permutation(side * side)[:n], side), axis=1)
 
 
-PLACES = {
+POSITIONS = {
     "uniform": lambda n, rng: rng.uniform(-0.25, 0.25, (n, 2)) * math.sqrt(n),
     "sparse": lambda n, rng: rng.uniform(-2, 2, (n, 2)) * math.sqrt(n),
     "clusters": _clusters,
     "one cell": lambda n, rng: rng.uniform(0.1, 0.3, (n, 2)),
-    "one place": lambda n, rng: np.full((n, 2), 2.5),
+    "one point": lambda n, rng: np.full((n, 2), 2.5),
     "line": _line,
     "upright line": lambda n, rng: _line(n, rng)[:, ::-1],
     "slanted line": lambda n, rng: _line(n, rng)[:, :1] * [1.0, -0.7],
@@ -59,7 +60,7 @@ PLACES = {
     "far from the origin": lambda n, rng: rng.uniform(-2, 2, (n, 2)) + [30_000, -20_000],
 }
 SETTINGS = {
-    "the worlds' own": {},
+    "default": {},
     "few and near": {"range_m": 0.4, "max_neighbours": 3},
     "one": {"max_neighbours": 1},
     "many and far": {"range_m": 4.0, "max_neighbours": 40},
@@ -68,9 +69,9 @@ SETTINGS = {
 
 
 def assert_same_step(pos, vel, pref, **settings):
-    """Neighbours, in their order, half-planes and velocities with the grid are those without; returns them."""
+    """With and without the grid neighbours, their order, half-planes and velocities are equal; returns the step."""
     expected = orca_step(pos, vel, pref, **settings)
-    found = orca_step(pos, vel, pref, grid=True, **settings)
+    found = orca_step(pos, vel, pref, use_grid=True, **settings)
     for one, other in zip(found.neighbours, expected.neighbours, strict=True):
         assert one.tolist() == other.tolist()
     for one, other in zip(found.planes, expected.planes, strict=True):
@@ -85,25 +86,25 @@ def moving(pos, rng):
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-@pytest.mark.parametrize("kind", PLACES)
-def test_a_step_by_grid_equals_one_without(kind, name):
-    listed = 0
+@pytest.mark.parametrize("kind", POSITIONS)
+def test_a_step_with_the_grid_equals_one_without(kind, name):
+    num_neighbours = 0
     for n in SIZES:
         rng = np.random.default_rng([n, len(kind), len(name)])
-        scene = tuple(moving(PLACES[kind](n, rng), rng))
-        for reach_m in (None, 0.0, 0.3):
+        scene = tuple(moving(POSITIONS[kind](n, rng), rng))
+        for search_radius_m in (None, 0.0, 0.3):
             hidden = int(rng.integers(-1, n))
-            result = assert_same_step(*scene, hidden=hidden, reach_m=reach_m, **SETTINGS[name])
+            result = assert_same_step(*scene, hidden=hidden, search_radius_m=search_radius_m, **SETTINGS[name])
             assert not any(hidden in found for found in result.neighbours)
-            listed += sum(len(found) for found in result.neighbours)
-    assert listed > 50
+            num_neighbours += sum(len(found) for found in result.neighbours)
+    assert num_neighbours > 50
 
 
-def test_float64_worlds_too():
+def test_float64_steps_are_equal_too():
     rng = np.random.default_rng(4)
     for n in SIZES:
         pos, vel, pref = rng.uniform(-3, 3, (n, 2)), rng.normal(0, 0.5, (n, 2)), rng.normal(0, 0.7, (n, 2))
-        assert_same_step(pos, vel, pref, real=np.float64, reach_m=0.3)
+        assert_same_step(pos, vel, pref, real=np.float64, search_radius_m=0.3)
 
 
 points = st.tuples(st.integers(-12, 12), st.integers(-12, 12))
@@ -111,80 +112,80 @@ points = st.tuples(st.integers(-12, 12), st.integers(-12, 12))
 
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(
-    places=st.lists(points, min_size=1, max_size=80),
+    cells=st.lists(points, min_size=1, max_size=80),
     spacing_m=st.sampled_from([0.125, 0.25, 0.3, 0.75, 1.5, 100.0]),
-    capacity=st.integers(1, 12),
+    max_neighbours=st.integers(1, 12),
     range_m=st.sampled_from([0.5, 0.75, 1.5, 3.0]),
-    reach_m=st.sampled_from([None, 0.0, 0.4]),
+    search_radius_m=st.sampled_from([None, 0.0, 0.4]),
     hidden=st.integers(-1, 79),
 )
-def test_ties_are_ordered_by_index_by_grid_too(places, spacing_m, capacity, range_m, reach_m, hidden):
-    pos = np.array(places, REAL) * REAL(spacing_m)
+def test_the_grid_orders_ties_by_index(cells, spacing_m, max_neighbours, range_m, search_radius_m, hidden):
+    pos = np.array(cells, REAL) * REAL(spacing_m)
     zero = np.zeros_like(pos)
     hidden = min(hidden, len(pos) - 1)
-    lists = assert_same_step(
-        pos, zero, zero, range_m=range_m, max_neighbours=capacity, reach_m=reach_m, hidden=hidden
-    ).neighbours
+    settings = {"range_m": range_m, "max_neighbours": max_neighbours, "hidden": hidden}
+    lists = assert_same_step(pos, zero, zero, search_radius_m=search_radius_m, **settings).neighbours
     for robot, found in enumerate(lists):
-        assert found.tolist() == brute_force(robot, pos, range_m, capacity, hidden)
+        assert found.tolist() == brute_force(robot, pos, range_m, max_neighbours, hidden)
 
 
-def assert_cells_hold_everybody_once(pos, done):
-    """`starts` parts the candidates; each robot is one of them, in its own cell, in order of index there."""
-    n, grid = len(pos), done.grid
+def assert_each_robot_is_in_one_cell(pos, tile):
+    """`cell_starts` partitions the candidates; each robot is one of them, in its cell, sorted by index there."""
+    n, grid = len(pos), tile.grid
     columns, bands = grid.shape
-    starts = grid.starts[: columns * bands + 1]
+    starts = grid.cell_starts[: columns * bands + 1]
     assert starts[0] == 0 and starts[-1] == n and (np.diff(starts) >= 0).all()
-    assert columns >= 1 and bands >= 1 and columns * bands < len(grid.starts)
-    slots = done.seen_slot[:n]
+    assert columns >= 1 and bands >= 1 and columns * bands < len(grid.cell_starts)
+    slots = tile.candidate_slot[:n]
     assert sorted(slots) == list(range(n))
-    np.testing.assert_array_equal(grid.place[slots], np.arange(n))
+    np.testing.assert_array_equal(grid.rank[slots], np.arange(n))
     np.testing.assert_array_equal(grid.cell[slots], np.repeat(np.arange(columns * bands), np.diff(starts)))
-    np.testing.assert_array_equal(np.stack([done.seen_x[:n], done.seen_y[:n]], axis=1), done.body[slots, :2])
+    candidates = np.stack([tile.candidate_x[:n], tile.candidate_y[:n]], axis=1)
+    np.testing.assert_array_equal(candidates, tile.pos_vel[slots, :2])
     same_cell = np.diff(grid.cell[slots]) == 0
     assert (np.diff(slots)[same_cell] > 0).all()
 
 
-def assert_cells_are_where_robots_are(pos, done, edge_m):
-    """Each robot's cell is the one that it stands in, of squares no smaller than asked for."""
-    low_x, low_y, per_m = done.grid.frame
-    columns, bands = done.grid.shape
-    assert per_m <= 1 / edge_m
+def assert_cells_contain_their_robots(pos, tile, cell_size_m):
+    """Each robot lies in its cell, and cells are no smaller than `cell_size_m`."""
+    low_x, low_y, per_m = tile.grid.frame
+    columns, bands = tile.grid.shape
+    assert per_m <= 1 / cell_size_m
     np.testing.assert_array_equal([low_x, low_y], pos.min(axis=0))
     column, band = ((pos.astype(np.float64) - [low_x, low_y]) * per_m).astype(int).T
     np.testing.assert_array_equal(
-        done.grid.cell, np.minimum(band, bands - 1) * columns + np.minimum(column, columns - 1)
+        tile.grid.cell, np.minimum(band, bands - 1) * columns + np.minimum(column, columns - 1)
     )
 
 
-def assert_rows_are_close_and_as_long_as_may_be(pos, done, rows):
-    """Each robot is in one lane of one row; rows keep to one band and a few cells, and none ends too early."""
-    n, columns = len(pos), done.grid.shape[0]
-    order = done.order[:rows]
-    assert order[order != n].tolist() == done.seen_slot[:n].tolist()
-    sizes = (order != n).sum(axis=1)
-    assert (sizes > 0).all() and ((order != n) == (np.arange(LANES) < sizes[:, None])).all()
-    first, last = done.grid.cell[order[:, 0]], done.grid.cell[order[np.arange(rows), sizes - 1]]
+def assert_rows_are_compact_and_maximal(pos, tile, rows):
+    """Each robot is in one lane of one row; a row stays in one band and a few cells, and does not end too early."""
+    n, columns = len(pos), tile.grid.shape[0]
+    slots = tile.row_slots[:rows]
+    assert slots[slots != n].tolist() == tile.candidate_slot[:n].tolist()
+    sizes = (slots != n).sum(axis=1)
+    assert (sizes > 0).all() and ((slots != n) == (np.arange(LANES) < sizes[:, None])).all()
+    first, last = tile.grid.cell[slots[:, 0]], tile.grid.cell[slots[np.arange(rows), sizes - 1]]
     assert (first // columns == last // columns).all() and (last - first <= ROW_SPAN_CELLS).all()
     can_go_on = (first[1:] // columns == first[:-1] // columns) & (first[1:] - first[:-1] <= ROW_SPAN_CELLS)
     assert (sizes[:-1][can_go_on] == LANES).all()
 
 
-def assert_arranged(pos, edge_m):
+def assert_valid_cell_list(pos, cell_size_m):
     """All of the above; returns the number of cells and of rows."""
     pos = np.asarray(pos, REAL)
-    done, rows = arranged(pos, edge_m)
-    assert_cells_hold_everybody_once(pos, done)
-    assert_cells_are_where_robots_are(pos, done, edge_m)
-    assert_rows_are_close_and_as_long_as_may_be(pos, done, rows)
-    return int(np.prod(done.grid.shape)), rows
+    tile, rows = cell_list(pos, cell_size_m)
+    assert_each_robot_is_in_one_cell(pos, tile)
+    assert_cells_contain_their_robots(pos, tile, cell_size_m)
+    assert_rows_are_compact_and_maximal(pos, tile, rows)
+    return int(np.prod(tile.grid.shape)), rows
 
 
-@pytest.mark.parametrize("kind", PLACES)
-def test_everybody_has_one_cell_and_one_lane(kind):
+@pytest.mark.parametrize("kind", POSITIONS)
+def test_each_robot_is_in_one_cell_and_one_lane(kind):
     for n in SIZES:
-        for edge_m in (0.05, 0.75, 50.0):
-            assert_arranged(PLACES[kind](n, np.random.default_rng(n)), edge_m)
+        for cell_size_m in (0.05, 0.75, 50.0):
+            assert_valid_cell_list(POSITIONS[kind](n, np.random.default_rng(n)), cell_size_m)
 
 
 coordinates = st.one_of(
@@ -195,15 +196,15 @@ coordinates = st.one_of(
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(
     pos=st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=60),
-    edge_m=st.sampled_from([1e-3, 0.2, 0.75, 10.0]),
+    cell_size_m=st.sampled_from([1e-3, 0.2, 0.75, 10.0]),
 )
-def test_wherever_robots_are_everybody_has_one_cell_and_one_lane(pos, edge_m):
-    assert_arranged(pos, edge_m)
+def test_each_robot_is_in_one_cell_and_one_lane_at_any_position(pos, cell_size_m):
+    assert_valid_cell_list(pos, cell_size_m)
 
 
-def test_cells_are_as_small_as_asked_for_where_robots_are_dense():
+def test_cells_of_a_dense_world_have_the_requested_size():
     pos = np.stack(np.divmod(np.arange(400), 20), axis=1) * 0.3
-    cells, rows = assert_arranged(pos, 0.75)
+    cells, rows = assert_valid_cell_list(pos, 0.75)
     assert cells == (19 * 0.3 // 0.75 + 1) ** 2
     assert rows < 400 / LANES * 1.5
 
@@ -217,17 +218,17 @@ WORLDS = {
 NUM_WORLDS, STEPS = 3, 50
 
 
-def searched(name, monkeypatch, grid):
-    """A freshly reset batch that is searched by grid or not, in an arena so small that groups meet soon."""
-    for module in (tile, step):
-        monkeypatch.setattr(module, "GRID_FROM_ROBOTS", 1 if grid else 10**9)
+def reset_worlds(name, monkeypatch, use_grid):
+    """A freshly reset batch with or without the grid, in an arena so small that the groups meet soon."""
+    for module in (tile_module, step):
+        monkeypatch.setattr(module, "GRID_FROM_ROBOTS", 1 if use_grid else 10**9)
     worlds = WorldBatch(WorldConfig(arena_radius_m=4.0, **WORLDS[name]), NUM_WORLDS)
     worlds.reset()
     return worlds
 
 
 def record(worlds):
-    """By name, everything that a run of 50 steps shows, `[STEPS, num_worlds, ...]`; the last world restarts once."""
+    """All results and states of 50 steps by name, `[STEPS, num_worlds, ...]`; the last world restarts once."""
     found = []
     for i in range(STEPS):
         if i == STEPS // 2:
@@ -237,10 +238,10 @@ def record(worlds):
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_worlds_step_by_grid_as_they_would_without(name, monkeypatch):
-    by_grid, without = searched(name, monkeypatch, True), searched(name, monkeypatch, False)
-    first, second = record(by_grid), record(without)
-    assert by_grid.tile.grid.shape.all() and not without.tile.grid.shape.any()
+def test_worlds_with_the_grid_step_like_worlds_without(name, monkeypatch):
+    with_grid, without = reset_worlds(name, monkeypatch, True), reset_worlds(name, monkeypatch, False)
+    first, second = record(with_grid), record(without)
+    assert with_grid.tile.grid.shape.all() and not without.tile.grid.shape.any()
     for key in first:
         np.testing.assert_array_equal(first[key], second[key], err_msg=key)
-    assert np.abs(first["pos_x"][-1] - first["pos_x"][0]).max() > 1  # they did move
+    assert np.abs(first["pos_x"][-1] - first["pos_x"][0]).max() > 1  # the robots did move

@@ -1,4 +1,4 @@
-"""Neighbours against numpy's stable argsort."""
+"""The neighbour search against numpy's stable argsort."""
 
 import numpy as np
 import pytest
@@ -8,21 +8,21 @@ from tests.sim_core.kernels import orca_step
 REAL = np.float32
 
 
-def neighbours_of(robot, pos, range_m, capacity, hidden=-1):
-    """List of the kernel's neighbours, nearest first."""
+def neighbours_of(robot, pos, range_m, max_neighbours, hidden=-1):
+    """The kernels' neighbours of `robot`, nearest first."""
     pos = np.asarray(pos, REAL)
     zero = np.zeros_like(pos)
-    settings = {"range_m": range_m, "max_neighbours": capacity, "hidden": hidden}
+    settings = {"range_m": range_m, "max_neighbours": max_neighbours, "hidden": hidden}
     return list(orca_step(pos, zero, zero, **settings).neighbours[robot])
 
 
-def brute_force(robot, pos, range_m, capacity, hidden=-1):
-    """The same by sorting everything; equal distances stay in index order."""
+def brute_force(robot, pos, range_m, max_neighbours, hidden=-1):
+    """The same list by sorting all robots; equal distances stay in index order."""
     delta = pos[robot] - pos
     dist_sq = delta[:, 0] * delta[:, 0] + delta[:, 1] * delta[:, 1]
     order = np.argsort(dist_sq, kind="stable")
     keep = (dist_sq[order] < REAL(range_m) ** 2) & (order != robot) & (order != hidden)
-    return list(order[keep][:capacity])
+    return list(order[keep][:max_neighbours])
 
 
 @pytest.mark.parametrize("step_m", [None, 0.25])
@@ -30,13 +30,13 @@ def test_random_scenes_match_a_sort(step_m):
     rng = np.random.default_rng(1)
     ties = 0
     for _ in range(400):
-        n, capacity = int(rng.integers(1, 60)), int(rng.integers(1, 16))
+        n, max_neighbours = int(rng.integers(1, 60)), int(rng.integers(1, 16))
         pos = rng.uniform(-2, 2, (n, 2)).astype(REAL)
-        if step_m is not None:  # a coarse grid: exact ties everywhere, also coincident robots
+        if step_m is not None:  # a coarse lattice: exact ties everywhere, and coincident robots
             pos = (np.round(pos / step_m) * step_m).astype(REAL)
         robot, hidden = int(rng.integers(n)), int(rng.integers(-1, n))
-        found = neighbours_of(robot, pos, 1.5, capacity, hidden)
-        assert found == brute_force(robot, pos, 1.5, capacity, hidden)
+        found = neighbours_of(robot, pos, 1.5, max_neighbours, hidden)
+        assert found == brute_force(robot, pos, 1.5, max_neighbours, hidden)
         distances = np.sum((pos[found] - pos[robot]) ** 2, axis=1)
         ties += len(distances) - len(np.unique(distances))
     assert (ties > 400) == (step_m is not None)
@@ -48,7 +48,7 @@ def test_a_full_list_keeps_the_lower_index_of_a_tie():
     assert neighbours_of(4, pos, 3.0, 3) == [0, 2, 3]
 
 
-def test_the_hidden_robot_is_nobodys_neighbour_but_has_some():
+def test_a_hidden_robot_is_nobodys_neighbour_but_has_neighbours():
     pos = [[0, 0], [0.1, 0], [0.2, 0]]
     for robot in (0, 2):
         assert 1 not in neighbours_of(robot, pos, 1.5, 10, hidden=1)
@@ -56,7 +56,7 @@ def test_the_hidden_robot_is_nobodys_neighbour_but_has_some():
     assert neighbours_of(1, pos, 1.5, 10, hidden=1) == [0, 2]
 
 
-def test_a_hidden_robot_takes_no_slot():
+def test_a_hidden_robot_takes_no_entry_of_a_list():
     pos = [[0, 0], [0.1, 0], [0.2, 0], [0.3, 0]]
     assert neighbours_of(0, pos, 1.5, 2, hidden=1) == [2, 3]
 
