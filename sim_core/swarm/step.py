@@ -120,7 +120,7 @@ def load_tile(first_world, num_worlds, state, tile, p):
 def _separation_gain(row, tile_index, num_separated, tile, rng, p):
     """Vector, gain of the published separation term: 1 + `separation_noise` x U[0, 1).
 
-    Robot i of a world uses draw i + 1 after the world's stream, so no draw depends on the order of the robots.
+    Robot i of a world takes draw i + 1 of the world's stream, in whatever order the robots are processed.
     """
     noisy = p.flock.rules == PUBLISHED and p.flock.separation_noise > p.flock.zero
     if not (noisy and any_lane(num_separated > p.flock.zero)):
