@@ -17,7 +17,7 @@ from actors.policy.baselines import ActionRule, Baseline, make_baseline
 from actors.policy.network import Policy, WeightsSnapshot
 from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
 from actors.rollout.worker import join_stats
-from actors.service.fault_policy import Action, CallFailed, PartKind, decide
+from actors.service.fault_policy import Action, CallFailed, ComponentKind, decide
 from actors.service.messages import NO_OUTCOME, EpisodeStats
 from actors.service.rpc import Calls, Ref
 from sim_core.checks import require
@@ -95,7 +95,7 @@ def _played(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: list[int], ref: 
             stats: EpisodeStats = calls.get(ref)
             return stats
         except CallFailed as failure:
-            if decide(PartKind.EVALUATOR, failure.fault, attempt, 0.0) is Action.STOP:
+            if decide(ComponentKind.EVALUATOR, failure.fault, attempt, 0.0) is Action.STOP:
                 raise
             ref = calls.run(evaluate, spec, candidate, seeds)
     raise AssertionError("count never ends")

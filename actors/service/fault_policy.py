@@ -18,7 +18,7 @@ GIVE_UP_S = 3_600.0
 """Time without a single call done after which a part is given up."""
 
 
-class PartKind(StrEnum):
+class ComponentKind(StrEnum):
     """What a run consists of."""
 
     WORKER = "rollout worker"
@@ -53,15 +53,17 @@ class Action(StrEnum):
     """The run ends; `shoal resume` goes on once the cause is mended."""
 
 
-class Part(NamedTuple):
+class Component(NamedTuple):
     """One part of a run."""
 
-    kind: PartKind
+    kind: ComponentKind
     number: int = 0
 
     def __str__(self) -> str:
         """What people call it."""
-        return f"{self.kind} {self.number}" if self.kind in (PartKind.WORKER, PartKind.SHARD) else str(self.kind)
+        return (
+            f"{self.kind} {self.number}" if self.kind in (ComponentKind.WORKER, ComponentKind.SHARD) else str(self.kind)
+        )
 
 
 class CallFailed(Exception):
@@ -83,26 +85,26 @@ def first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-class PartFailed(Exception):
+class ComponentFailed(Exception):
     """A part of the run failed.
 
     Args:
-      part: which.
+      component: which.
       incarnation: of which of its starts the failure tells.
       fault: how.
       reason: one line for people.
     """
 
-    def __init__(self, part: Part, incarnation: int, fault: Fault, reason: str) -> None:
-        super().__init__(part, incarnation, fault, reason)
-        self.part = part
+    def __init__(self, component: Component, incarnation: int, fault: Fault, reason: str) -> None:
+        super().__init__(component, incarnation, fault, reason)
+        self.component = component
         self.incarnation = incarnation
         self.fault = fault
         self.reason = reason
 
     def __str__(self) -> str:
         """A sentence for people."""
-        return f"{self.part} {self.fault} ({self.reason})"
+        return f"{self.component} {self.fault} ({self.reason})"
 
 
 class RunFailed(RuntimeError):
@@ -110,20 +112,20 @@ class RunFailed(RuntimeError):
 
 
 _REPLACE = {
-    PartKind.WORKER: Action.RESTART,
-    PartKind.SHARD: Action.RESTART,
-    PartKind.LEARNER: Action.REBUILD,
-    PartKind.EVALUATOR: Action.RETRY,
+    ComponentKind.WORKER: Action.RESTART,
+    ComponentKind.SHARD: Action.RESTART,
+    ComponentKind.LEARNER: Action.REBUILD,
+    ComponentKind.EVALUATOR: Action.RETRY,
 }
 """How a part is replaced. What the learner knows is in checkpoints alone; an evaluation holds nothing."""
 
 _HARMLESS_TWICE = {
-    (PartKind.SHARD, Fault.UNREACHABLE),  # pushes carry incarnation and sequence number, draws change nothing
-    (PartKind.SHARD, Fault.OBJECT_LOST),
+    (ComponentKind.SHARD, Fault.UNREACHABLE),  # pushes carry incarnation and sequence number, draws change nothing
+    (ComponentKind.SHARD, Fault.OBJECT_LOST),
 }
 
 
-def decide(kind: PartKind, fault: Fault, attempts: int, age_s: float) -> Action:
+def decide(kind: ComponentKind, fault: Fault, attempts: int, age_s: float) -> Action:
     """What to do about a failure.
 
     Args:
@@ -146,10 +148,10 @@ class Decision(NamedTuple):
     attempts: int
 
 
-class Mended(NamedTuple):
+class Recovered(NamedTuple):
     """A part works again: its failures in a row, the last one and its action, and how long it was out."""
 
-    part: Part
+    component: Component
     fault: Fault
     action: Action
     attempts: int
@@ -163,23 +165,23 @@ class _Streak(NamedTuple):
     action: Action
 
 
-class Recovery:
+class FaultTracker:
     """Remembers each part's failures in a row, and decides about the next one."""
 
     def __init__(self) -> None:
-        self._streaks: dict[Part, _Streak] = {}
+        self._streaks: dict[Component, _Streak] = {}
 
-    def failed(self, failure: PartFailed, now_s: float) -> Decision:
+    def failed(self, failure: ComponentFailed, now_s: float) -> Decision:
         """Decides about a failure at `now_s`."""
-        before = self._streaks.get(failure.part)
+        before = self._streaks.get(failure.component)
         since_s, attempts = (before.since_s, before.attempts + 1) if before else (now_s, 1)
-        action = decide(failure.part.kind, failure.fault, attempts, now_s - since_s)
-        self._streaks[failure.part] = _Streak(since_s, attempts, failure.fault, action)
+        action = decide(failure.component.kind, failure.fault, attempts, now_s - since_s)
+        self._streaks[failure.component] = _Streak(since_s, attempts, failure.fault, action)
         return Decision(action, attempts)
 
-    def worked(self, part: Part, now_s: float) -> Mended | None:
-        """Notes that `part` has done a call; tells if it had failed before."""
-        streak = self._streaks.pop(part, None)
+    def worked(self, component: Component, now_s: float) -> Recovered | None:
+        """Notes that `component` has done a call; tells if it had failed before."""
+        streak = self._streaks.pop(component, None)
         if streak is None:
             return None
-        return Mended(part, streak.fault, streak.action, streak.attempts, now_s - streak.since_s)
+        return Recovered(component, streak.fault, streak.action, streak.attempts, now_s - streak.since_s)

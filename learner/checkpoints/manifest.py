@@ -11,7 +11,7 @@ import json
 import re
 from typing import Any, NamedTuple
 
-from actors.storage.part_writer import FileSum
+from actors.storage.fragment_writer import FileSum
 from actors.storage.uri import is_plain
 from sim_core.checks import ConfigError
 

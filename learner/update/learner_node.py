@@ -13,11 +13,11 @@ from safetensors.torch import load_file, save_file
 
 from actors.policy.network import WeightsSnapshot
 from actors.replay.node import ShardNode
-from actors.service.fault_policy import CallFailed, Part, PartFailed, PartKind
+from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind
 from actors.service.messages import STORES, WAITS, AddReply, Delivered, Draws, SampleReply, TransitionBlock
 from actors.service.rpc import Calls, Node, Ref
 from actors.service.stopwatch import Stopwatch
-from actors.storage.part_writer import PartWriter, Written, join_written
+from actors.storage.fragment_writer import FragmentWriter, WriteResult, join_results
 from actors.storage.uri import Location, fetched, inside
 from learner.update.double_dqn import importance_weights
 from learner.update.learner import Learner
@@ -77,7 +77,7 @@ class LearnerNode:
         self._masses = np.zeros(len(shards), np.float64)
         self._answers: dict[int, Ref] = {}
         self._samples = DrawAhead(self._sample) if draws_ahead else DrawWhenAsked(self._sample)
-        self._writer = PartWriter()
+        self._writer = FragmentWriter()
         self._watch = Stopwatch()
         self.publish()
 
@@ -107,13 +107,13 @@ class LearnerNode:
         """What a call of the shard of this index gave.
 
         Raises:
-          PartFailed: the shard failed; nothing has been learned meanwhile.
+          ComponentFailed: the shard failed; nothing has been learned meanwhile.
         """
         try:
             return self._shard_calls.get(ref)
         except CallFailed as failure:
-            part = Part(PartKind.SHARD, index)
-            raise PartFailed(part, self._shard_incarnations[index], failure.fault, failure.reason) from failure
+            part = Component(ComponentKind.SHARD, index)
+            raise ComponentFailed(part, self._shard_incarnations[index], failure.fault, failure.reason) from failure
 
     def _slow_result(self, index: int, ref: Ref) -> Any:
         """`_result` of a call that reads a whole shard; the caller's deadline is for all of them."""
@@ -198,7 +198,7 @@ class LearnerNode:
           The rest of their state, for JSON.
 
         Raises:
-          PartFailed: a shard failed.
+          ComponentFailed: a shard failed.
         """
         self._take_answers()
         tensors = self._learner.get_state()
@@ -209,23 +209,23 @@ class LearnerNode:
         shards = [self._result(i, ref) for i, ref in enumerate(refs)]
         return {"shards": shards, "rng": self._rng.bit_generator.state, "sizes": self._masses.tolist()}
 
-    def saved(self, timeout_s: float = 0.0) -> Written | None:
+    def saved(self, timeout_s: float = 0.0) -> WriteResult | None:
         """How the last `save` ended, all shards included; None while something of it is being written.
 
         Args:
           timeout_s: how long to wait for each.
 
         Raises:
-          PartFailed: a shard failed, and the others have written.
+          ComponentFailed: a shard failed, and the others have written.
         """
         parts, failures = [self._writer.result(timeout_s)], []
         refs = [self._shard_calls.start(shard, "saved", timeout_s) for shard in self._shards]
         for i, ref in enumerate(refs):
             try:
                 parts.append(self._result(i, ref))
-            except PartFailed as failure:
+            except ComponentFailed as failure:
                 failures.append(failure)
-        written = join_written(parts)
+        written = join_results(parts)
         if written is not None and failures:
             raise failures[0]
         return written

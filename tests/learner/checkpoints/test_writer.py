@@ -7,9 +7,9 @@ import uuid
 import fsspec
 import pytest
 
-from actors.service.fault_policy import CallFailed, Fault, Part, PartFailed, PartKind
+from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, Fault
 from actors.service.rpc import LocalCalls
-from actors.storage.part_writer import PartWriter
+from actors.storage.fragment_writer import FragmentWriter
 from actors.storage.uri import as_location, check_writable, fetched, inside
 from learner.checkpoints.checkpoint import Keep, newest_valid
 from learner.checkpoints.manifest import CheckpointError, UselessCheckpointError
@@ -24,7 +24,7 @@ class Node:
     def __init__(self, name):
         self.name, self.content, self.go = name, b"", threading.Event()
         self.go.set()
-        self._writer = PartWriter()
+        self._writer = FragmentWriter()
         self.fails = False
         self.fault = None
 
@@ -51,7 +51,7 @@ class Run:
     def __init__(self, root):
         self.root = root
         self.nodes = {name: Node(name) for name in ("learner", "worker")}
-        parts = (Part(PartKind.LEARNER), Part(PartKind.WORKER, 3))
+        parts = (Component(ComponentKind.LEARNER), Component(ComponentKind.WORKER, 3))
         self.writers = [Writer(part, 7, node) for part, node in zip(parts, self.nodes.values(), strict=True)]
         self.checkpointer = Checkpointer(root, LocalCalls(), 60.0)
         self.scores = []
@@ -167,7 +167,11 @@ def test_a_part_that_fails_is_told_once_the_others_have_written(run, fault):
     slow.go.set()
     ended = run.checkpointer.wait()
     assert ended.location is None and "rollout worker 3" in ended.error
-    assert (ended.failure.part, ended.failure.incarnation, ended.failure.fault) == (run.writers[1].part, 7, fault)
+    assert (ended.failure.component, ended.failure.incarnation, ended.failure.fault) == (
+        run.writers[1].component,
+        7,
+        fault,
+    )
     assert run.files() == before
     run.nodes["worker"].fault = None
     assert run.write(300).error is None and newest_valid(run.root)[0].state["env_steps"] == 300
@@ -177,7 +181,7 @@ def test_a_checkpoint_that_could_not_begin_waits_for_those_who_had_begun(run):
     slow = run.nodes["learner"]
     slow.go.clear()
     run.save(100)
-    failure = PartFailed(run.writers[1].part, 7, Fault.DIED, "simulated")
+    failure = ComponentFailed(run.writers[1].component, 7, Fault.DIED, "simulated")
     run.checkpointer.drop(Moment(100, 0, 700), run.writers[:1], failure)
     assert run.checkpointer.is_busy and run.checkpointer.poll() is None
     slow.go.set()

@@ -20,30 +20,30 @@ class FileSum(NamedTuple):
     sha256: str
 
 
-class Written(NamedTuple):
+class WriteResult(NamedTuple):
     """How writing a part ended: its files, by name relative to the checkpoint's folder; else why it failed."""
 
     files: dict[str, FileSum]
     error: str | None
 
 
-def join_written(parts: list[Written | None]) -> Written | None:
+def join_results(parts: list[WriteResult | None]) -> WriteResult | None:
     """How several parts ended: None while one is being written, else all their files and the first failure."""
     ended = [part for part in parts if part is not None]
     if len(ended) < len(parts):
         return None
     errors = [part.error for part in ended if part.error is not None]
     files = {name: found for part in ended for name, found in part.files.items()}
-    return Written(files, errors[0] if errors else None)
+    return WriteResult(files, errors[0] if errors else None)
 
 
-class PartWriter:
+class FragmentWriter:
     """Writes parts in a thread, one at a time."""
 
     def __init__(self) -> None:
         self._thread: threading.Thread | None = None
         self._is_blocked = False
-        self._written = Written({}, "nothing was being written: the process is a new one")
+        self._written = WriteResult({}, "nothing was being written: the process is a new one")
 
     def start(self, location: Location, write: Callable[[Path], None]) -> bool:
         """Starts writing the file or folder at `location`.
@@ -69,15 +69,15 @@ class PartWriter:
                 files = {name: file_sum(path) for name, path in files_under(local).items()}
                 if local is location:
                     sync_all(local)
-            self._written = Written(files, None)
+            self._written = WriteResult(files, None)
         except Exception as error:  # whatever a disk, a storage's client or a format raises: the run goes on
-            self._written = Written({}, f"{type(error).__name__}: {error}")
+            self._written = WriteResult({}, f"{type(error).__name__}: {error}")
         threading.Thread(target=give_back, name="shoal-memory", daemon=True).start()  # nobody waits for it
 
-    def result(self, timeout_s: float = 0.0) -> Written | None:
+    def result(self, timeout_s: float = 0.0) -> WriteResult | None:
         """How the last part ended; None while it is still being written after `timeout_s`."""
         if self._is_blocked:
-            return Written({}, "the part of an earlier checkpoint is still being written")
+            return WriteResult({}, "the part of an earlier checkpoint is still being written")
         if self._thread is not None:
             self._thread.join(timeout_s)
             if self._thread.is_alive():
