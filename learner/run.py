@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import closing
 from typing import NamedTuple
 
-from actors.evaluation.evaluator import evaluate_in_parts
+from actors.evaluation.evaluator import evaluate_in_parallel
 from actors.policy.network import WeightsSnapshot
 from actors.service.fault_policy import CallFailed, ComponentFailed, FaultTracker, RunFailed, first_line
 from actors.service.messages import EpisodeStats
@@ -248,6 +248,6 @@ def final_evaluation(config: RunConfig, cluster: Cluster, weights: WeightsSnapsh
     seeds = list(range(first, first + config.final_eval_episodes))
     shared = cluster.calls.put(weights)
     try:
-        return evaluate_in_parts(cluster.calls, config.env, shared, seeds, cluster.eval_tasks)
+        return evaluate_in_parallel(cluster.calls, config.env, shared, seeds, cluster.eval_tasks)
     except CallFailed as failure:
         raise RunFailed(f"the evaluation at the end {failure.fault} again and again: {failure.reason}") from failure

@@ -16,7 +16,7 @@ from actors.replay.prioritised import PrioritisedShard, PrioritySettings
 from actors.replay.shard import ReplayShard
 from actors.service.messages import AddReply, Delivered, SampleReply, TransitionBlock
 from actors.storage.fragment_writer import FragmentWriter, WriteResult
-from actors.storage.malloc import keep_large_apart
+from actors.storage.malloc import limit_fragmentation
 from actors.storage.uri import Location, fetched
 
 REMEMBERED_BLOCKS = 8
@@ -44,7 +44,7 @@ class ShardNode:
     """A replay shard that tells every worker of newer weights."""
 
     def __init__(self, settings: ShardSettings) -> None:
-        keep_large_apart()  # blocks come and go here
+        limit_fragmentation()  # blocks come and go here
         self.shard = make_shard(settings)
         self._writer = FragmentWriter()
         self._weights: WeightsSnapshot | None = None

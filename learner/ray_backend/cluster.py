@@ -29,7 +29,7 @@ from ray.exceptions import (
     WorkerCrashedError,
 )
 
-from actors.evaluation.evaluator import Candidate, evaluate_in_parts
+from actors.evaluation.evaluator import Candidate, evaluate_in_parallel
 from actors.replay.node import ShardNode
 from actors.rollout.node import RolloutNode
 from actors.rollout.vector_env import EnvSpec, env_shape
@@ -228,7 +228,7 @@ def evaluate_in_tasks(spec: EnvSpec, candidate: Candidate, seeds: list[int], add
     connect(1, address)
     calls = RayCalls(DEADLINE_S)
     try:
-        return evaluate_in_parts(calls, spec, calls.put(candidate), seeds, cluster_cpus())
+        return evaluate_in_parallel(calls, spec, calls.put(candidate), seeds, cluster_cpus())
     finally:
         leave()
 

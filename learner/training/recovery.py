@@ -161,7 +161,7 @@ class Mender:
 
     def worked(self, part: Component) -> None:
         """Notes that a part has done a call."""
-        mended = self._recovery.worked(part, time.monotonic())
+        mended = self._recovery.record_success(part, time.monotonic())
         if mended is not None:
             self._observer.mended(mended)
 
@@ -175,7 +175,7 @@ class Mender:
           RunLost: the run must go on from its last checkpoint.
           RunFailed: it cannot go on.
         """
-        decision = self._recovery.failed(failure, time.monotonic())
+        decision = self._recovery.record_failure(failure, time.monotonic())
         self._observer.failed(failure, decision)
         if decision.action is Action.STOP:
             raise RunFailed(f"{failure}, {decision.attempts} times in a row; mend the cause, then go on with resume")

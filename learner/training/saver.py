@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from actors.service.fault_policy import Component, ComponentFailed, ComponentKind
-from actors.storage.uri import Location, inside
+from actors.storage.uri import Location, join_location
 from learner.checkpoints.checkpoint import Checkpoint, Keep
 from learner.checkpoints.retention import Scored, scores_of
 from learner.checkpoints.writer import Checkpointer, Ended, Moment, Writer
@@ -159,4 +159,4 @@ class Saver:
 
 
 def _worker_file(folder: Location, worker: Component) -> Location:
-    return inside(folder, f"worker-{worker.number}.safetensors")
+    return join_location(folder, f"worker-{worker.number}.safetensors")

@@ -18,7 +18,7 @@ from actors.service.messages import STORES, WAITS, AddReply, Delivered, Draws, S
 from actors.service.rpc import Calls, Node, Ref
 from actors.service.stopwatch import Stopwatch
 from actors.storage.fragment_writer import FragmentWriter, WriteResult, join_results
-from actors.storage.uri import Location, fetched, inside
+from actors.storage.uri import Location, fetched, join_location
 from learner.update.double_dqn import importance_weights
 from learner.update.learner import Learner
 from learner.update.prefetch import DrawAhead, DrawWhenAsked
@@ -169,7 +169,7 @@ class LearnerNode:
         drawn = [(chances[i], reply.draws) for i, reply in zip(asked, replies, strict=True) if reply.draws is not None]
         if not drawn:
             return Sample(columns, None, None)
-        number = np.concatenate([draws.number for _, draws in drawn])[order]
+        number = np.concatenate([draws.insertion_index for _, draws in drawn])[order]
         probability = np.concatenate([chance * draws.probability for chance, draws in drawn])[order]
         return Sample(columns, np.repeat(asked, shares[asked])[order], Draws(number, probability))
 
@@ -178,7 +178,7 @@ class LearnerNode:
         assert sample.draws is not None
         for i in np.unique(sample.shard) if sample.shard is not None else [0]:
             mine = slice(None) if sample.shard is None else sample.shard == i
-            answer = (sample.draws.number[mine], self._learner.td_errors[mine])
+            answer = (sample.draws.insertion_index[mine], self._learner.td_errors[mine])
             self._answers[int(i)] = self._shard_calls.start(self._shards[i], "set_priorities", *answer)
 
     def _take_answers(self) -> None:
@@ -202,7 +202,7 @@ class LearnerNode:
         """
         self._take_answers()
         tensors = self._learner.get_state()
-        self._writer.start(inside(folder, WEIGHTS), lambda path: save_file(tensors, str(path)))
+        self._writer.start(join_location(folder, WEIGHTS), lambda path: save_file(tensors, str(path)))
         refs = [
             self._shard_calls.start(shard, "save", _shard_folder(folder, i)) for i, shard in enumerate(self._shards)
         ]
@@ -236,7 +236,7 @@ class LearnerNode:
         Raises:
           ValueError: the files are damaged or do not fit this run.
         """
-        location = inside(folder, WEIGHTS)
+        location = join_location(folder, WEIGHTS)
         try:
             with fetched(location) as path:
                 self._learner.set_state(load_file(str(path)))
@@ -262,4 +262,4 @@ class LearnerNode:
 
 
 def _shard_folder(folder: Location, shard: int) -> Location:
-    return inside(folder, f"shard-{shard}.zarr")
+    return join_location(folder, f"shard-{shard}.zarr")

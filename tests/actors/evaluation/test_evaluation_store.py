@@ -156,6 +156,6 @@ def test_another_versions_settings_are_refused(saved, settings):
 def test_what_is_no_evaluation_is_refused(path):
     with pytest.raises(ValueError, match="missing"):
         load_evaluation(path)
-    storage.save_rows(path, np.zeros(3, evaluation_store.EPISODE))
+    storage.save_rows(path, np.zeros(3, evaluation_store.EPISODE_DTYPE))
     with pytest.raises(ValueError, match="format"):
         load_evaluation(path)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from actors.evaluation import evaluator
-from actors.evaluation.evaluator import evaluate, evaluate_in_parts, record_episode, record_frames
+from actors.evaluation.evaluator import evaluate, evaluate_in_parallel, record_episode, record_frames
 from actors.policy.baselines import Baseline
 from actors.policy.network import Policy
 from actors.rollout.vector_env import EnvSpec
@@ -71,7 +71,7 @@ def test_parts_give_the_whole_in_the_order_of_the_seeds(swarm, make_weights, nam
     calls = LocalCalls()
     seeds = SEEDS[::-1]
     whole = evaluate(spec, candidate, seeds)
-    joined = evaluate_in_parts(calls, spec, calls.put(candidate), seeds, parts)
+    joined = evaluate_in_parallel(calls, spec, calls.put(candidate), seeds, parts)
     for first, second in zip(joined, whole, strict=True):
         np.testing.assert_array_equal(first, second)
     assert len(set(whole.length_steps)) > 3  # or their order would not show
@@ -79,7 +79,7 @@ def test_parts_give_the_whole_in_the_order_of_the_seeds(swarm, make_weights, nam
 
 def test_no_seeds_in_parts(swarm):
     calls = LocalCalls()
-    none = evaluate_in_parts(calls, swarm, calls.put(Baseline.RANDOM), [], 4)
+    none = evaluate_in_parallel(calls, swarm, calls.put(Baseline.RANDOM), [], 4)
     assert [len(column) for column in none] == [0, 0, 0]
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from actors.replay.prioritised import SMALLEST, PrioritisedShard, PrioritySettings
+from actors.replay.prioritised import PRIORITY_EPSILON, PrioritisedShard, PrioritySettings
 from actors.replay.shard import ReplayShard
 from tests.actors.replay.test_shard import DTYPE, make_block
 from tests.packed import as_rows
@@ -46,17 +46,18 @@ def test_priorities_stay_with_their_rows(capacity, steps, seed):
             for number, error in zip(numbers.tolist(), errors.tolist(), strict=True):
                 stale += number not in oracle
                 if number in oracle:
-                    oracle[number] = (abs(error) + SMALLEST) ** ALPHA
+                    oracle[number] = (abs(error) + PRIORITY_EPSILON) ** ALPHA
                     largest = max(largest, oracle[number])
         if oracle:
             reply = shard.sample(5)
-            np.testing.assert_array_equal(reply.draws.number, reply.columns["action"])
-            shares = [oracle[number] / sum(oracle.values()) for number in reply.draws.number.tolist()]
+            np.testing.assert_array_equal(reply.draws.insertion_index, reply.columns["action"])
+            shares = [oracle[number] / sum(oracle.values()) for number in reply.draws.insertion_index.tolist()]
             np.testing.assert_allclose(reply.draws.probability, shares, rtol=1e-12)
             assert reply.mass == pytest.approx(sum(oracle.values()), rel=1e-12)
-            drawn.append(reply.draws.number)
+            drawn.append(reply.draws.insertion_index)
         assert by_number(shard) == pytest.approx(oracle, rel=1e-14)
-    assert shard.stale == stale and shard.inserted == total
+    state = shard.get_state()
+    assert (state["stale"], state["inserted"]) == (stale, total)
 
 
 @pytest.mark.parametrize("exponent", [0.0, 0.6, 1.0])
@@ -65,7 +66,7 @@ def test_rows_are_drawn_in_proportion_to_their_tds_power(exponent):
     shard.add(make_block(range(70)))
     shard.set_priorities(np.arange(20, 70), errors * np.where(np.arange(50) % 2, 1, -1).astype(np.float32))
     drawn = shard.sample(200_000)
-    shares = (errors.astype(np.float64) + SMALLEST) ** exponent
+    shares = (errors.astype(np.float64) + PRIORITY_EPSILON) ** exponent
     shares /= shares.sum()
     expected = 200_000 * shares
     counts = np.bincount(drawn.columns["action"], minlength=70)
@@ -92,9 +93,9 @@ def test_new_rows_have_the_largest_priority_so_far():
     shard.add(make_block([4, 5], 1))
     shard.set_priorities(np.array([1]), np.array([0.125], np.float32))
     shard.add(make_block([6], 2))
-    largest = (9 + SMALLEST) ** ALPHA
+    largest = (9 + PRIORITY_EPSILON) ** ALPHA
     assert [by_number(shard)[number] for number in (4, 5, 6)] == pytest.approx([largest] * 3)
-    assert by_number(shard)[1] == pytest.approx((0.125 + SMALLEST) ** ALPHA)
+    assert by_number(shard)[1] == pytest.approx((0.125 + PRIORITY_EPSILON) ** ALPHA)
 
 
 def test_a_row_without_error_is_still_drawn_some_day():
@@ -110,18 +111,18 @@ def test_overwritten_rows_are_left_out_and_counted():
     drawn = np.arange(8)
     shard.add(make_block(range(8, 15), 1))  # in the place of 0 to 4
     shard.set_priorities(drawn, np.full(8, 2.0, np.float32))
-    changed = (2 + SMALLEST) ** ALPHA
+    changed = (2 + PRIORITY_EPSILON) ** ALPHA
     assert by_number(shard) == pytest.approx({**{n: changed for n in (5, 6, 7)}, **{n: 1.0 for n in range(8, 15)}})
-    assert shard.stale == 5
+    assert shard.get_state()["stale"] == 5
     shard.set_priorities(np.array([-1, 15, 99]), np.full(3, 5.0, np.float32))  # of a shard that lived longer
-    assert shard.stale == 8 and max(by_number(shard).values()) == pytest.approx(changed)
+    assert shard.get_state()["stale"] == 8 and max(by_number(shard).values()) == pytest.approx(changed)
 
 
 def test_the_last_answer_of_a_row_counts():
     shard = make_shard(4)
     shard.add(make_block(range(4)))
     shard.set_priorities(np.array([2, 1, 2, 2]), np.array([9, 4, 7, 0.5], np.float32))
-    assert by_number(shard)[2] == pytest.approx((0.5 + SMALLEST) ** ALPHA)
+    assert by_number(shard)[2] == pytest.approx((0.5 + PRIORITY_EPSILON) ** ALPHA)
 
 
 @pytest.mark.parametrize("error", [np.nan, np.inf, -np.inf])
@@ -143,7 +144,7 @@ def test_repeated_blocks_change_no_priorities():
     shard.add(make_block(range(5), 3))
     shard.set_priorities(np.arange(5), np.full(5, 0.5, np.float32))
     assert shard.add(make_block(range(5), 3)).duplicate
-    assert shard.mass == pytest.approx(5 * (0.5 + SMALLEST) ** ALPHA)
+    assert shard.mass == pytest.approx(5 * (0.5 + PRIORITY_EPSILON) ** ALPHA)
 
 
 def filled(tmp_path, inserted=(21, 3)):
@@ -151,7 +152,7 @@ def filled(tmp_path, inserted=(21, 3)):
     shard = make_shard(16, seed=11)
     first, second = inserted
     shard.add(make_block(range(first), sequence=3, worker_id=2))
-    shard.set_priorities(shard.sample(9).draws.number, np.linspace(-4, 9, 9, dtype=np.float32))
+    shard.set_priorities(shard.sample(9).draws.insertion_index, np.linspace(-4, 9, 9, dtype=np.float32))
     shard.add(make_block(range(first, first + second), sequence=4, worker_id=2))
     shard.set_priorities(np.array([0, first]), np.array([1.5, 3.5], np.float32))
     shard.snapshot().save(tmp_path / "shard.zarr")
@@ -163,15 +164,15 @@ def test_a_saved_shard_goes_on_bit_by_bit(tmp_path, inserted):
     shard, state = filled(tmp_path, inserted)
     resumed = make_shard(16, seed=99)
     resumed.add(make_block(range(500, 516)))
-    resumed.set_priorities(resumed.sample(16).draws.number, np.full(16, 77, np.float32))
+    resumed.set_priorities(resumed.sample(16).draws.insertion_index, np.full(16, 77, np.float32))
     resumed.load(tmp_path / "shard.zarr", state)
     assert resumed.get_state() == shard.get_state() and resumed.mass == shard.mass
-    assert resumed.stale == (1 if sum(inserted) > 16 else 0)
+    assert resumed.get_state()["stale"] == (1 if sum(inserted) > 16 else 0)
     for copy in (shard, resumed):
         for sequence in (5, 6):
             drawn = copy.sample(50)
             copy.add(make_block(range(200, 205), sequence, worker_id=2))
-            copy.set_priorities(drawn.draws.number, drawn.columns["reward"] / 7)
+            copy.set_priorities(drawn.draws.insertion_index, drawn.columns["reward"] / 7)
     one, two = shard.sample(50), resumed.sample(50)
     np.testing.assert_array_equal(as_rows(one.columns), as_rows(two.columns))
     np.testing.assert_array_equal(one.draws, two.draws)
@@ -183,7 +184,7 @@ def test_what_comes_after_the_snapshot_is_not_in_it(tmp_path):
     shard, state = filled(tmp_path)
     snapshot, before = shard.snapshot(), shard.priorities.copy()
     shard.add(make_block(range(300, 309), sequence=5, worker_id=2))
-    shard.set_priorities(shard.sample(16).draws.number, np.linspace(0.1, 90, 16, dtype=np.float32))
+    shard.set_priorities(shard.sample(16).draws.insertion_index, np.linspace(0.1, 90, 16, dtype=np.float32))
     snapshot.save(tmp_path / "later.zarr")
     resumed, expected = make_shard(16), make_shard(16)
     resumed.load(tmp_path / "later.zarr", state)

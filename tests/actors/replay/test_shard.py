@@ -49,6 +49,12 @@ def held(shard, draws=600):
     return set(rows["action"].tolist())
 
 
+def counters(shard):
+    """(transitions inserted, transitions dropped) since the start."""
+    state = shard.get_state()
+    return state["inserted"], state["dropped"]
+
+
 @given(capacity=st.integers(1, 12), lengths=st.lists(st.integers(0, 30), min_size=1, max_size=12))
 @settings(max_examples=80, deadline=None)
 def test_holds_the_newest_rows_like_a_deque(capacity, lengths):
@@ -58,7 +64,7 @@ def test_holds_the_newest_rows_like_a_deque(capacity, lengths):
         assert shard.add(make_block(numbers, sequence)) == Stored(length, False)
         oracle.extend(numbers)
         total += length
-        assert (shard.size, shard.inserted) == (len(oracle), total)
+        assert (shard.size, *counters(shard)) == (len(oracle), total, 0)
         if oracle:
             assert held(shard) == set(oracle)
 
@@ -74,7 +80,7 @@ def test_repeated_late_and_outdated_blocks_are_dropped(incarnation, sequence):
     shard.add(make_block([1, 2], sequence=5, incarnation=1))
     again = make_block([3, 4, 5], sequence=sequence, incarnation=incarnation)
     assert shard.add(again) == Stored(0, True)
-    assert (shard.size, shard.inserted, shard.dropped) == (2, 2, 3)
+    assert (shard.size, *counters(shard)) == (2, 2, 3)
     assert held(shard) == {1, 2}
 
 
@@ -91,7 +97,7 @@ def test_new_blocks_are_stored(header):
     shard = ReplayShard(DTYPE, 100, 0)
     shard.add(make_block([1, 2], sequence=5, incarnation=1))
     assert shard.add(make_block([3], **header)) == Stored(1, False)
-    assert held(shard) == {1, 2, 3} and shard.dropped == 0
+    assert held(shard) == {1, 2, 3} and counters(shard) == (3, 0)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +113,7 @@ def test_another_schema_is_refused_and_may_be_sent_again(other):
     shard = ReplayShard(DTYPE, 10, 0)
     with pytest.raises(ValueError, match="schema"):
         shard.add(make_block([1], **other))
-    assert (shard.size, shard.inserted, shard.dropped) == (0, 0, 0)
+    assert (shard.size, *counters(shard)) == (0, 0, 0)
     assert shard.add(make_block([1])) == Stored(1, False)
 
 
@@ -160,7 +166,7 @@ def test_a_saved_shard_goes_on_where_it_was(tmp_path):
     resumed = ReplayShard(DTYPE, 16, 999)
     resumed.add(make_block(range(500, 516)))
     resumed.load(tmp_path / "shard.zarr", state)
-    assert (resumed.size, resumed.inserted, resumed.dropped) == (16, 24, 8)
+    assert (resumed.size, *counters(resumed)) == (16, 24, 8)
     np.testing.assert_array_equal(as_rows(resumed.sample(50).columns), as_rows(shard.sample(50).columns))
     for copy in (shard, resumed):
         assert copy.add(make_block([1], sequence=3, worker_id=2)).duplicate
@@ -213,10 +219,11 @@ def test_frames_are_given_up_with_their_rows():
     shard = ReplayShard(DTYPE, 100, 0)
     for sequence in range(60):
         shard.add(make_block(range(70 * sequence, 70 * (sequence + 1)), sequence))
-        numbers = range(max(0, shard.inserted - 100), shard.inserted)
+        inserted = 70 * (sequence + 1)
+        numbers = range(max(0, inserted - 100), inserted)
         lead_to_frames = sum(number % 3 == 0 or number % 70 == 69 for number in numbers)
         assert len(shard._frames.numbers) == lead_to_frames
-    assert len(shard._frames.frames) == frame_ring.SMALLEST
+    assert len(shard._frames.slots) == frame_ring.MIN_CAPACITY
 
 
 @pytest.mark.parametrize(
@@ -230,7 +237,7 @@ def test_rows_that_lead_to_nothing_are_refused(tmp_path, slot, next_row):
     shard._rows["next_row"][slot] = next_row
     save_rows(tmp_path / "shard.zarr", shard._rows)
     save_rows(tmp_path / "shard.zarr" / "frames", shard._frames.snapshot())
-    with pytest.raises(ValueError, match=r"shard\.zarr has rows that lead to observations which it does not hold"):
+    with pytest.raises(ValueError, match=r"shard\.zarr has rows whose next observations are missing"):
         ReplayShard(DTYPE, 16, 0).load(tmp_path / "shard.zarr", state)
 
 
@@ -245,7 +252,7 @@ def test_frames_of_another_moment_are_refused(tmp_path, numbers):
     assert state["frames"] == [0, 6]
     other = ReplayShard(DTYPE, 16, 0)
     other.add(make_block(range(100, 116)))
-    with pytest.raises(ValueError, match="rows that lead to|no ring of frames|two whole numbers"):
+    with pytest.raises(ValueError, match="next observations are missing|no ring of frames|two whole numbers"):
         other.load(tmp_path / "shard.zarr", {**state, "frames": numbers})
     assert held(other) == set(range(100, 116))
 
@@ -267,7 +274,7 @@ def test_rows_that_do_not_fit_their_frames_are_refused_and_may_be_sent_again(cha
     shard, block = ReplayShard(DTYPE, 100, 0), make_block(range(16))
     with pytest.raises(ValueError, match="and the frames that they lead to"):
         shard.add(block._replace(packed=change(block.packed)))
-    assert (shard.size, shard.inserted, shard.dropped) == (0, 0, 0)
+    assert (shard.size, *counters(shard)) == (0, 0, 0)
     assert shard.add(block) == Stored(16, False) and held(shard) == set(range(16))
 
 
@@ -280,14 +287,15 @@ def with_next_row(packed, slot, next_row):
 
 def test_numbers_of_frames_begin_anew(tmp_path):
     shard = ReplayShard(DTYPE, 100, 0)
-    shard._frames._first = shard._frames._next = packing.NUMBERS - 20
+    shard._frames._first = shard._frames._next = packing.FRAME_MODULUS - 20
     for sequence in range(8):
         shard.add(make_block(range(30 * sequence, 30 * (sequence + 1)), sequence))
-        assert held(shard, 5_000) == set(range(max(0, shard.inserted - 100), shard.inserted))
+        inserted = 30 * (sequence + 1)
+        assert held(shard, 5_000) == set(range(max(0, inserted - 100), inserted))
         again = ReplayShard(DTYPE, 100, 0)
         again.load(tmp_path / "shard.zarr", saved(shard, tmp_path))
         assert held(again, 5_000) == held(shard, 5_000)
-    assert shard._frames.numbers.stop > packing.NUMBERS
+    assert shard._frames.numbers.stop > packing.FRAME_MODULUS
 
 
 @pytest.mark.parametrize(

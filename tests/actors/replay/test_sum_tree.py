@@ -38,7 +38,7 @@ def masses(uniform, strata, total):
 def test_finds_what_a_search_in_the_cumulated_sums_finds(values, count, strata, seed):
     """Whole numbers have exact sums, so the slots must be the same."""
     uniform = np.random.default_rng(seed).random(count)
-    slots, found = tree_of(values).find(uniform, strata)
+    slots, found = tree_of(values).stratified_sample(uniform, strata)
     expected = np.searchsorted(np.cumsum(values), masses(uniform, strata, sum(values)), side="right")
     np.testing.assert_array_equal(slots, expected)
     np.testing.assert_array_equal(found, np.asarray(values, float)[expected])
@@ -50,7 +50,7 @@ def test_finds_what_a_search_in_the_cumulated_sums_finds(values, count, strata, 
 )
 @settings(max_examples=200, deadline=None)
 def test_rounding_leads_to_no_zero_and_not_far(values, uniform):
-    slots, found = tree_of(values).find(np.array(uniform), len(uniform))
+    slots, found = tree_of(values).stratified_sample(np.array(uniform), len(uniform))
     assert (found > 0).all()
     ends = np.cumsum(values)
     wanted, slack = masses(uniform, len(uniform), ends[-1]), 1e-13 * ends[-1]
@@ -80,7 +80,7 @@ def test_changes_leave_the_tree_that_the_numbers_alone_make(case):
             tree.fill(start, count, value)
             expected[start : start + count] = value
         else:
-            tree.put(np.array([slot for slot, _ in step], np.int64), np.array([value for _, value in step]))
+            tree.set(np.array([slot for slot, _ in step], np.int64), np.array([value for _, value in step]))
             for slot, value in step:
                 expected[slot] = value
     np.testing.assert_array_equal(tree.values, expected)
@@ -94,7 +94,7 @@ def test_sums_do_not_drift():
     tree.fill(0, 1000, 1e8)
     for _ in range(300):
         slots = rng.integers(1000, size=400)
-        tree.put(slots, rng.choice([1e-6, 1e8], size=400))
+        tree.set(slots, rng.choice([1e-6, 1e8], size=400))
     tree.fill(0, 1000, 1e-6)
     assert tree.total == pytest.approx(1e-3, rel=1e-13)
 
@@ -108,7 +108,7 @@ def test_shorter_numbers_leave_zeros_behind_them():
 @pytest.mark.parametrize("strata", [1, 64, 100_000])
 def test_numbers_are_drawn_in_proportion(strata):
     values = np.random.default_rng(1).choice([0.0, 0.1, 1.0, 3.0], size=100)
-    slots, _ = tree_of(values).find(np.random.default_rng(2).random(100_000), strata)
+    slots, _ = tree_of(values).stratified_sample(np.random.default_rng(2).random(100_000), strata)
     counts, positive = np.bincount(slots, minlength=100), values > 0
     assert not counts[~positive].any()
     expected = 100_000 * values / values.sum()
@@ -118,5 +118,5 @@ def test_numbers_are_drawn_in_proportion(strata):
 
 
 def test_a_part_takes_one_draw_from_each_piece():
-    slots, _ = tree_of(np.full(16, 0.25)).find(np.random.default_rng(3).random(16 * 5), 16)
+    slots, _ = tree_of(np.full(16, 0.25)).stratified_sample(np.random.default_rng(3).random(16 * 5), 16)
     np.testing.assert_array_equal(slots.reshape(5, 16), np.tile(np.arange(16), (5, 1)))

@@ -102,15 +102,6 @@ def test_termination_counts_no_future_and_truncation_does(end, discounts):
     np.testing.assert_allclose(rows["reward"], returns[: len(rows)], rtol=1e-6)
 
 
-def test_clear_forgets_waiting_steps():
-    rewards, ends = np.ones((4, 2)), np.zeros((4, 2), int)
-    assembler = NStepAssembler(ROW, 2, 3, DISCOUNT)
-    push_all(assembler, rewards, ends, range(2))
-    assembler.clear()
-    rows = push_all(assembler, rewards, ends, range(2, 4))
-    assert len(rows) == 0
-
-
 @given(history=histories(), n_step=st.integers(1, 5), cut=st.integers(0, 6))
 @settings(max_examples=100, deadline=None)
 def test_only_what_no_row_begins_with_is_kept_as_a_frame(history, n_step, cut):

@@ -79,33 +79,33 @@ def failure(part, fault=Fault.DIED):
 
 
 def test_failures_in_a_row_count_until_the_part_works():
-    recovery = FaultTracker()
-    assert [recovery.failed(failure(WORKER), i).attempts for i in range(3)] == [1, 2, 3]
-    assert recovery.worked(WORKER, 10.0) == Recovered(WORKER, Fault.DIED, Action.RESTART, 3, 10.0)
-    assert recovery.worked(WORKER, 11.0) is None
-    assert recovery.failed(failure(WORKER), 12.0).attempts == 1
+    tracker = FaultTracker()
+    assert [tracker.record_failure(failure(WORKER), i).attempts for i in range(3)] == [1, 2, 3]
+    assert tracker.record_success(WORKER, 10.0) == Recovered(WORKER, Fault.DIED, Action.RESTART, 3, 10.0)
+    assert tracker.record_success(WORKER, 11.0) is None
+    assert tracker.record_failure(failure(WORKER), 12.0).attempts == 1
 
 
 def test_parts_do_not_count_for_each_other():
-    recovery = FaultTracker()
+    tracker = FaultTracker()
     for _ in range(MAX_ATTEMPTS):
-        recovery.failed(failure(WORKER), 0.0)
+        tracker.record_failure(failure(WORKER), 0.0)
     for part in (Component(ComponentKind.WORKER, 2), SHARD, LEARNER, EVALUATOR):
-        assert recovery.failed(failure(part), 0.0).attempts == 1
-    assert recovery.failed(failure(WORKER), 0.0).action is Action.STOP
+        assert tracker.record_failure(failure(part), 0.0).attempts == 1
+    assert tracker.record_failure(failure(WORKER), 0.0).action is Action.STOP
 
 
 def test_the_age_counts_from_the_first_failure_in_a_row():
-    recovery = FaultTracker()
-    recovery.failed(failure(LEARNER), 100.0)
-    assert recovery.failed(failure(LEARNER), 100.0 + GIVE_UP_S).action is Action.REBUILD
-    assert recovery.failed(failure(LEARNER), 100.1 + GIVE_UP_S).action is Action.STOP
+    tracker = FaultTracker()
+    tracker.record_failure(failure(LEARNER), 100.0)
+    assert tracker.record_failure(failure(LEARNER), 100.0 + GIVE_UP_S).action is Action.REBUILD
+    assert tracker.record_failure(failure(LEARNER), 100.1 + GIVE_UP_S).action is Action.STOP
 
 
 def test_a_part_that_became_unreachable_and_then_died_is_replaced():
-    recovery = FaultTracker()
-    assert recovery.failed(failure(SHARD, Fault.UNREACHABLE), 0.0).action is Action.RETRY
-    assert recovery.failed(failure(SHARD, Fault.DIED), 0.0).action is Action.RESTART
+    tracker = FaultTracker()
+    assert tracker.record_failure(failure(SHARD, Fault.UNREACHABLE), 0.0).action is Action.RETRY
+    assert tracker.record_failure(failure(SHARD, Fault.DIED), 0.0).action is Action.RESTART
 
 
 def test_failures_name_the_part_and_travel_between_processes():

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.skipif(memory._trim is None, reason="a C library other 
 
 LIBC = """
 import ctypes, psutil
-from actors.storage.malloc import give_back, keep_large_apart
+from actors.storage.malloc import trim_heap, limit_fragmentation
 libc = ctypes.CDLL(None)
 libc.malloc.restype = ctypes.c_void_p
 libc.free.argtypes = [ctypes.c_void_p]
@@ -26,7 +26,7 @@ for place in taken:
 for place in taken[:-1]:  # the last one holds the end of the heap
     libc.free(place)
 before = own_mb()
-give_back()
+trim_heap()
 print(before - own_mb())
 """
 LARGE = """
@@ -56,4 +56,4 @@ def test_holes_in_the_heap_go_back_to_the_system():
 
 def test_large_pieces_go_back_to_the_system_when_they_are_freed():
     assert printed(LARGE.format("")) < 20  # MB, of 120
-    assert printed(LARGE.format("keep_large_apart()")) > 100
+    assert printed(LARGE.format("limit_fragmentation()")) > 100

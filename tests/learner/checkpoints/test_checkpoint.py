@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from actors.storage.fragment_writer import FragmentWriter, file_sum, join_results
-from actors.storage.uri import inside
+from actors.storage.uri import join_location
 from learner.checkpoints.checkpoint import (
     Keep,
     best_valid,
@@ -39,7 +39,7 @@ def save_parts(draft, seed=0):
     parts = []
     for name, write in writes.items():
         writer = FragmentWriter()
-        writer.start(inside(draft, name), write)
+        writer.start(join_location(draft, name), write)
         parts.append(writer.result(30.0))
     written = join_results(parts)
     assert written.error is None

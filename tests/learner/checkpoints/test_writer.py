@@ -10,7 +10,7 @@ import pytest
 from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, Fault
 from actors.service.rpc import LocalCalls
 from actors.storage.fragment_writer import FragmentWriter
-from actors.storage.uri import as_location, check_writable, fetched, inside
+from actors.storage.uri import check_writable, fetched, join_location, parse_location
 from learner.checkpoints.checkpoint import Keep, newest_valid
 from learner.checkpoints.manifest import CheckpointError, UselessCheckpointError
 from learner.checkpoints.retention import Scored
@@ -30,7 +30,7 @@ class Node:
 
     def save(self, draft, content):
         self.content = content
-        self._writer.start(inside(draft, self.name), self._write)
+        self._writer.start(join_location(draft, self.name), self._write)
 
     def _write(self, path):
         self.go.wait(60)
@@ -88,10 +88,10 @@ class Run:
 @pytest.fixture(params=["folder", "memory", "s3"])
 def run(request, tmp_path):
     if request.param == "folder":
-        return Run(as_location(f"file://{tmp_path}/checkpoints"))
+        return Run(parse_location(f"file://{tmp_path}/checkpoints"))
     if request.param == "memory":
-        return Run(as_location(f"memory://{uuid.uuid4()}/checkpoints/"))
-    return Run(as_location(f"{request.getfixturevalue('s3_server')}/{uuid.uuid4()}"))
+        return Run(parse_location(f"memory://{uuid.uuid4()}/checkpoints/"))
+    return Run(parse_location(f"{request.getfixturevalue('s3_server')}/{uuid.uuid4()}"))
 
 
 def test_what_was_written_is_read_back(run):
@@ -101,7 +101,7 @@ def test_what_was_written_is_read_back(run):
     assert found.folder == ended.location and not skipped
     assert found.state == {"env_steps": 100, "updates": 5}
     for name in run.nodes:
-        with fetched(inside(found.folder, name)) as path:
+        with fetched(join_location(found.folder, name)) as path:
             assert (path / "rows").read_bytes() == f"{name} at 100, 5".encode()
             assert sorted(file.name for file in path.iterdir()) == ["more", "rows"]
 
@@ -293,7 +293,7 @@ def test_urls_that_cannot_work_are_refused_with_a_sentence(s3_server):
     with pytest.raises(ConfigError, match="nosuchprotocol://x cannot be opened"):
         check_writable("nosuchprotocol://x")
     with pytest.raises(ConfigError, match="must not hold a user or password"):
-        as_location("s3://key:secret@bucket/x")
+        parse_location("s3://key:secret@bucket/x")
     check_writable(f"{s3_server}/fine")
     with pytest.raises(CheckpointError, match="cannot be listed"):
         newest_valid("s3://no-such-bucket-here/x")

@@ -241,7 +241,9 @@ def test_nothing_writes_on_after_a_crash(store, cell, tmp_path, monkeypatch):
     monkeypatch.setattr("actors.storage.fragment_writer.sync_all", slow_sync)
     with pytest.raises(Crash):
         run_cell(SWEEP, cell, SweepPlace(tmp_path, store, "cells"), crashing_at(1_500))  # one begins at 1,000
-    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith(("shoal-part", "shoal-ch"))]
+    assert not [
+        thread.name for thread in threading.enumerate() if thread.name.startswith(("shoal-fragment", "shoal-ch"))
+    ]
     checkpoints = tmp_path / cell.key / "checkpoints"
     assert [path.name for path in checkpoints.iterdir()] == finished_names(checkpoints)
 

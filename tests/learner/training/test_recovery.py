@@ -134,7 +134,7 @@ def test_a_run_without_faults_has_nothing_to_mend(run, config):
     loop, calls, listener, cluster = run(config, lambda node, method: None)
     assert not listener.failures and calls.faults == 0
     assert sum(loop._progress.ledger.dropped.values()) == 0
-    assert sum(shard.shard.inserted for shard in cluster.targets) == loop._progress.ledger.stored
+    assert sum(shard.shard.get_state()["inserted"] for shard in cluster.targets) == loop._progress.ledger.stored
     assert_accounts(loop, listener, config)
 
 
@@ -147,7 +147,7 @@ def test_workers_that_fail_at_random_lose_nothing_that_was_delivered(run, config
     assert_accounts(loop, listener, config)
     assert loop._progress.ledger.dropped["shard lost"] == 0
     shards = [node.shard for node in (cluster.targets if placement == "actors" else cluster.learner._shards)]
-    assert sum(shard.inserted for shard in shards) == loop._progress.ledger.stored
+    assert sum(shard.get_state()["inserted"] for shard in shards) == loop._progress.ledger.stored
     assert loop.updates > 50
 
 
@@ -176,10 +176,10 @@ def test_a_push_whose_reply_is_lost_is_stored_once(run, config, kind):
     loop, calls, listener, cluster = run(config, at_random(0, 0.1, (kind,), ShardNode))
     assert calls.faults >= 20
     assert_accounts(loop, listener, config)
-    inserted = sum(shard.shard.inserted for shard in cluster.targets)
+    inserted = sum(shard.shard.get_state()["inserted"] for shard in cluster.targets)
     if not any(decision.action is Action.RESTART for _, decision in listener.failures):
         assert inserted == loop._progress.ledger.stored
-    refused = sum(shard.shard.dropped for shard in cluster.targets)
+    refused = sum(shard.shard.get_state()["dropped"] for shard in cluster.targets)
     assert (refused > 0) == (kind == "unreachable after")
 
 
