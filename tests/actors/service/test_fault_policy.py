@@ -1,4 +1,4 @@
-"""The decision table, every entry of it, and its memory."""
+"""Every entry of the decision table, and the tracker of consecutive failures."""
 
 import itertools
 import pickle
@@ -32,7 +32,7 @@ replay shard    restart  restart  retry        retry
 learner         rebuild  rebuild  rebuild      rebuild
 evaluation      retry    retry    retry        retry
 """
-"""What is done about a first failure, as a person would write it down."""
+"""The reaction to a first failure, as a person would write it down."""
 
 
 def written_down():
@@ -51,14 +51,14 @@ def test_the_table_is_the_one_written_down():
 
 
 @pytest.mark.parametrize(("kind", "fault"), list(itertools.product(ComponentKind, Fault)))
-def test_every_part_is_given_up_in_the_end_and_not_before(kind, fault):
+def test_every_component_is_given_up_at_the_limits_and_not_before(kind, fault):
     for attempts, age_s in itertools.product(ATTEMPTS, AGES_S):
         stops = decide(kind, fault, attempts, age_s) is Action.STOP
         assert stops == (attempts > MAX_ATTEMPTS or age_s > GIVE_UP_S)
 
 
 @pytest.mark.parametrize(("kind", "fault"), list(itertools.product(ComponentKind, Fault)))
-def test_a_retry_that_does_not_help_becomes_a_replacement(kind, fault):
+def test_a_component_is_replaced_after_too_many_retries(kind, fault):
     first = decide(kind, fault, 1, 0.0)
     for attempts in range(1, MAX_ATTEMPTS + 1):
         action = decide(kind, fault, attempts, 0.0)
@@ -68,17 +68,17 @@ def test_a_retry_that_does_not_help_becomes_a_replacement(kind, fault):
             assert action is first
 
 
-def test_only_calls_that_may_be_made_twice_are_retried():
+def test_only_idempotent_calls_are_retried():
     for kind, fault, attempts in itertools.product(ComponentKind, Fault, ATTEMPTS):
         if decide(kind, fault, attempts, 0.0) is Action.RETRY:
             assert kind in (ComponentKind.SHARD, ComponentKind.EVALUATOR)
 
 
-def failure(part, fault=Fault.DIED):
-    return ComponentFailed(part, 0, fault, "test")
+def failure(component, fault=Fault.DIED):
+    return ComponentFailed(component, 0, fault, "test")
 
 
-def test_failures_in_a_row_count_until_the_part_works():
+def test_consecutive_failures_count_until_a_success():
     tracker = FaultTracker()
     assert [tracker.record_failure(failure(WORKER), i).attempts for i in range(3)] == [1, 2, 3]
     assert tracker.record_success(WORKER, 10.0) == Recovered(WORKER, Fault.DIED, Action.RESTART, 3, 10.0)
@@ -86,31 +86,31 @@ def test_failures_in_a_row_count_until_the_part_works():
     assert tracker.record_failure(failure(WORKER), 12.0).attempts == 1
 
 
-def test_parts_do_not_count_for_each_other():
+def test_failures_are_counted_per_component():
     tracker = FaultTracker()
     for _ in range(MAX_ATTEMPTS):
         tracker.record_failure(failure(WORKER), 0.0)
-    for part in (Component(ComponentKind.WORKER, 2), SHARD, LEARNER, EVALUATOR):
-        assert tracker.record_failure(failure(part), 0.0).attempts == 1
+    for component in (Component(ComponentKind.WORKER, 2), SHARD, LEARNER, EVALUATOR):
+        assert tracker.record_failure(failure(component), 0.0).attempts == 1
     assert tracker.record_failure(failure(WORKER), 0.0).action is Action.STOP
 
 
-def test_the_age_counts_from_the_first_failure_in_a_row():
+def test_the_age_counts_from_the_first_consecutive_failure():
     tracker = FaultTracker()
     tracker.record_failure(failure(LEARNER), 100.0)
     assert tracker.record_failure(failure(LEARNER), 100.0 + GIVE_UP_S).action is Action.REBUILD
     assert tracker.record_failure(failure(LEARNER), 100.1 + GIVE_UP_S).action is Action.STOP
 
 
-def test_a_part_that_became_unreachable_and_then_died_is_replaced():
+def test_a_component_that_became_unreachable_and_then_died_is_replaced():
     tracker = FaultTracker()
     assert tracker.record_failure(failure(SHARD, Fault.UNREACHABLE), 0.0).action is Action.RETRY
     assert tracker.record_failure(failure(SHARD, Fault.DIED), 0.0).action is Action.RESTART
 
 
-def test_failures_name_the_part_and_travel_between_processes():
+def test_failures_name_the_component_and_can_be_pickled():
     for error in (ComponentFailed(WORKER, 3, Fault.LATE, "collect: silent for 9 s"), CallFailed(Fault.DIED, "gone")):
         again = pickle.loads(pickle.dumps(error))
         assert type(again) is type(error) and vars(again) == vars(error)
     assert str(ComponentFailed(WORKER, 3, Fault.LATE, "silent")) == "rollout worker 1 late (silent)"
-    assert [str(part) for part in (SHARD, LEARNER, EVALUATOR)] == ["replay shard 0", "learner", "evaluation"]
+    assert [str(component) for component in (SHARD, LEARNER, EVALUATOR)] == ["replay shard 0", "learner", "evaluation"]
