@@ -28,12 +28,13 @@ EPISODE_DTYPE = np.dtype(
 class StoredEvaluation(NamedTuple):
     """An evaluation as it is stored.
 
-    `spec` is the environment, `player` the name of a run or a baseline, and `updates` the number of updates applied to
-    the policy's weights, 0 for a baseline. `seed` `[episodes]` int64 holds the episodes' seeds in the order of `stats`.
+    `spec` is the environment, `candidate` the name of a run or a baseline, and `updates` the number of updates applied
+    to the policy's weights, 0 for a baseline. `seed` `[episodes]` int64 holds the episodes' seeds in the order of
+    `stats`.
     """
 
     spec: EnvSpec
-    player: str
+    candidate: str
     updates: int
     seed: NDArray[np.int64]
     stats: EpisodeStats
@@ -61,7 +62,7 @@ def save_evaluation(path: Path, evaluation: StoredEvaluation) -> None:
     header: dict[str, Any] = {
         "env_id": evaluation.spec.env_id,
         "world": dataclasses.asdict(evaluation.spec.world),
-        "player": evaluation.player,
+        "player": evaluation.candidate,
         "updates": evaluation.updates,
     }
     zarr.open_group(str(part), mode="r+").attrs.update({"header": header, "header_crc32": _crc32(header)})

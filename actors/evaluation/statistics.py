@@ -100,19 +100,6 @@ def ratio(samples: Sequence[Sequence[tuple[int, int]]]) -> Estimate:
     return Estimate(binomial.value, low, high)
 
 
-def rate_difference(first: tuple[int, int], second: tuple[int, int]) -> Estimate:
-    """Rate of `first` less that of `second`, each (count, total), with Newcombe's interval (1998, method 10).
-
-    Raises:
-      ValueError: one of them has no trials.
-    """
-    one, two = rate(*first), rate(*second)
-    value = one.value - two.value
-    low = value - float(np.hypot(one.value - one.low, two.high - two.value))
-    high = value + float(np.hypot(one.high - one.value, two.value - two.low))
-    return Estimate(value, low, high)
-
-
 def mean(values: np.ndarray) -> Estimate:
     """Mean of `values` `[count]` with its Student t interval, which has width 0 for a single value."""
     centre = float(np.mean(values))

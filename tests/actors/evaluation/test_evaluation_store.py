@@ -22,7 +22,7 @@ def make_evaluation(episodes=50, seed=0):
     rng = np.random.default_rng(seed)
     return StoredEvaluation(
         spec=EnvSpec(ENV_ID, WorldConfig(robots=3, groups=4, method="out", apf_gain_m4_s=0.1 + 0.2)),
-        player="a run ×",
+        candidate="a run ×",
         updates=123_456,
         seed=2_000_000_000 + np.arange(episodes),
         stats=EpisodeStats(

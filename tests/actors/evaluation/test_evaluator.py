@@ -37,7 +37,7 @@ def play(env, policy, seed):
 def test_an_evaluation_equals_single_episodes(name, request, make_weights):
     spec = request.getfixturevalue(name)
     weights = make_weights(spec, seed=3)
-    env = SwarmEnv(**vars(spec.world)) if spec.is_swarm else gym.make(spec.env_id)
+    env = SwarmEnv(**spec.settings) if spec.is_swarm else gym.make(spec.env_id)
     expected = [play(env, Policy(weights), seed) for seed in SEEDS]
     stats = evaluate(spec, weights, SEEDS)
     assert list(zip(stats.outcome, stats.length_steps, strict=True)) == [row[:2] for row in expected]
@@ -135,7 +135,7 @@ def test_a_recorded_episode_equals_the_evaluated_one(swarm, make_weights):
 
 def test_a_recorded_episode_holds_every_state(swarm, make_weights):
     episode = record_episode(swarm, make_weights(swarm), SEEDS[0])
-    worlds = SwarmEnv(**vars(swarm.world))
+    worlds = SwarmEnv(**swarm.settings)
     worlds.reset(seed=SEEDS[0])
     for t, action in enumerate(episode.action):
         np.testing.assert_array_equal(episode.position[t], worlds.worlds.positions()[0])

@@ -39,7 +39,7 @@ def odd_id():
 
 def single_envs(spec):
     if spec.is_swarm:
-        return [SwarmEnv(**vars(spec.world)) for _ in range(NUM_ENVS)]
+        return [SwarmEnv(**spec.settings) for _ in range(NUM_ENVS)]
     return [gym.make(spec.env_id) for _ in range(NUM_ENVS)]
 
 

@@ -46,7 +46,7 @@ def assert_same_block(first, second):
 
 def by_hand(spec, worlds, rows):
     """Steps worlds from the state `worlds` with the actions of `rows`; returns expected columns and ended episodes."""
-    env = SwarmVectorEnv(NUM_ENVS, **vars(spec.world))
+    env = SwarmVectorEnv(NUM_ENVS, **spec.settings)
     observation = env.worlds.set_state(worlds)
     columns, ended = [], []
     for step in rows.reshape(-1, NUM_ENVS):
