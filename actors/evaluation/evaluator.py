@@ -55,7 +55,7 @@ def make_action_rule(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> A
     """
     if isinstance(candidate, WeightsSnapshot):
         return GreedyPolicy(candidate)
-    require(spec.is_swarm, f"the baseline {candidate} plays in our own environment only, not in {spec.env_id}")
+    require(spec.is_swarm, f"the baseline {candidate} plays in the swarm environment only, not in {spec.env_id}")
     return make_baseline(candidate, spec.world, seeds)
 
 

@@ -91,7 +91,7 @@ def ratio(samples: Sequence[Sequence[tuple[int, int]]]) -> Estimate:
     binomial = rate(count, total)
     variance, freedom = 0.0, 0
     for pairs in samples:
-        residuals = np.array([part - binomial.value * whole for part, whole in pairs])
+        residuals = np.array([pair[0] - binomial.value * pair[1] for pair in pairs])
         if len(residuals) > 1:
             variance += len(residuals) * float(np.var(residuals, ddof=1))
             freedom += len(residuals) - 1

@@ -106,7 +106,7 @@ class ReplayShard:
             raise ValueError(
                 f"block of worker {header.worker_id} has schema {header.schema_version}, rows {rows.dtype}, and "
                 f"{len(frames)} frames {frames.dtype}{frames.shape[1:]}; this shard takes schema {SCHEMA_VERSION}, "
-                f"rows {self._rows.dtype}, and the frames that they lead to"
+                f"rows {self._rows.dtype}, and the frames that they refer to"
             )
         if not self._is_new(header):
             self._dropped += count

@@ -48,7 +48,7 @@ class Action(StrEnum):
     RESTART = "restart"
     """Start a new incarnation: a worker with the current weights and fresh random streams, a shard empty."""
     REBUILD = "rebuild"
-    """Start every component anew from the last checkpoint."""
+    """Start every component again, from the last checkpoint."""
     STOP = "stop"
     """End the run; `shoal resume` continues it once the cause is fixed."""
 

@@ -118,7 +118,7 @@ def test_a_recorded_baseline_equals_the_evaluated_one(swarm, baseline):
 
 
 def test_a_baseline_in_another_environment_is_refused(cart_pole):
-    with pytest.raises(ConfigError, match="random plays in our own environment only, not in CartPole-v1"):
+    with pytest.raises(ConfigError, match="random plays in the swarm environment only, not in CartPole-v1"):
         evaluate(cart_pole, Baseline.RANDOM, SEEDS)
 
 

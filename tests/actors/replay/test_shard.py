@@ -273,7 +273,7 @@ def test_frames_of_another_snapshot_are_refused(tmp_path, numbers):
 )
 def test_a_block_whose_frames_do_not_match_is_refused_and_may_be_sent_again(change):
     shard, block = ReplayShard(DTYPE, 100, 0), make_block(range(16))
-    with pytest.raises(ValueError, match="and the frames that they lead to"):
+    with pytest.raises(ValueError, match="and the frames that they refer to"):
         shard.add(block._replace(packed=change(block.packed)))
     assert (shard.size, *counters(shard)) == (0, 0, 0)
     assert shard.add(block) == Stored(16, False) and held(shard) == set(range(16))
