@@ -1,1 +1,1 @@
-"""What runs many times: policy, exploration, rollout worker, replay shard, evaluator."""
+"""Components that run many times: rollout workers with their policy, replay shards, and the evaluator."""

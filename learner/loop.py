@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from actors.evaluation.evaluator import evaluate
 from actors.policy.network import WeightsSnapshot
 from actors.rollout.exploration import epsilon
-from actors.service.fault_policy import CallFailed, Part, PartFailed, PartKind, Recovery
+from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, FaultTracker
 from actors.service.messages import BlockReport, EpisodeStats
 from actors.storage.uri import Location
 from learner.checkpoints.checkpoint import Checkpoint
@@ -30,7 +30,7 @@ from learner.training.saver import LEARNER, SaveObserver, Saver
 
 EVAL_SEED = 1_000_000_000
 """First seed of evaluations during training; training worlds draw theirs from other streams."""
-EVALUATOR = Part(PartKind.EVALUATOR)
+EVALUATOR = Component(ComponentKind.EVALUATOR)
 
 
 class Observer(FaultObserver, SaveObserver, Protocol):
@@ -63,7 +63,7 @@ class TrainingLoop:
         checkpoints: Location,
         observer: Observer,
         stop: Callable[[], bool],
-        recovery: Recovery | None = None,
+        recovery: FaultTracker | None = None,
         keep_best: int = 0,
     ) -> None:
         self._config = config
@@ -76,7 +76,7 @@ class TrainingLoop:
         self._ledger = Ledger(len(cluster.workers), cluster.capacities(config))
         self._progress = Progress(config, self._pacer, self._ledger)
         self._under_way = UnderWay(len(cluster.workers), cluster.deadline_s, cluster.start_deadline_s)
-        self._mender = Mender(cluster, recovery or Recovery(), self._under_way, self._pacer, self._ledger, observer)
+        self._mender = Mender(cluster, recovery or FaultTracker(), self._under_way, self._pacer, self._ledger, observer)
         checkpointer = Checkpointer(checkpoints, cluster.calls, cluster.queue_deadline_s)
         self._saver = Saver(config, keep_best, checkpointer, self._mender, self._progress, journal, observer)
         self._restored = False
@@ -106,7 +106,7 @@ class TrainingLoop:
           RuntimeError: nothing is under way and nothing may start.
           RunLost: a part failed that only a checkpoint can bring back.
           RunFailed: a part fails again and again.
-          PartFailed: a part failed before the first round.
+          ComponentFailed: a part failed before the first round.
         """
         try:
             return self._run()
@@ -140,7 +140,7 @@ class TrainingLoop:
         for worker in self._mender.workers:
             try:
                 self._mender.ask(worker, "set_weights", weights)
-            except PartFailed as failure:
+            except ComponentFailed as failure:
                 self._mend(failure)
 
     def _start_collects(self) -> None:
@@ -180,7 +180,7 @@ class TrainingLoop:
         ref = self._calls.run(evaluate, self._config.env, self._mender.weights_ref(), seeds)
         self._under_way.add(ref, Pending("eval", EVALUATOR, self._mender.incarnation(EVALUATOR), self.env_steps))
 
-    def _start(self, part: Part, method: str, amount: int, *args: Any) -> None:
+    def _start(self, part: Component, method: str, amount: int, *args: Any) -> None:
         ref = self._calls.start(self._mender.node(part), method, *args)
         self._under_way.add(ref, Pending(method, part, self._mender.incarnation(part), amount))
 
@@ -199,7 +199,7 @@ class TrainingLoop:
                 result = self._calls.get(ref)
             except CallFailed as error:
                 self._take_failure(pending, pending.failed(error))
-            except PartFailed as failure:  # of a part that the called one needs
+            except ComponentFailed as failure:  # of a part that the called one needs
                 self._take_failure(pending, failure)
             else:
                 self._take_result(pending, result)
@@ -207,7 +207,7 @@ class TrainingLoop:
             self._mend(failed)
 
     def _take_result(self, pending: Pending, result: Any) -> None:
-        self._mender.worked(pending.part)
+        self._mender.worked(pending.component)
         if pending.kind == "collect":
             self._take_blocks(result)
         elif pending.kind == "update":
@@ -215,15 +215,15 @@ class TrainingLoop:
         else:
             self._take_evaluation(result, pending.amount)
 
-    def _take_failure(self, pending: Pending, failure: PartFailed) -> None:
+    def _take_failure(self, pending: Pending, failure: ComponentFailed) -> None:
         if pending.kind == "update":
             self._pacer.not_sampled(pending.amount)
         self._mend(failure)
 
-    def _mend(self, failure: PartFailed) -> None:
+    def _mend(self, failure: ComponentFailed) -> None:
         unreported = self._mender.mend(failure)
         self._progress.env_steps += unreported.env_steps
-        if failure.part == EVALUATOR:
+        if failure.component == EVALUATOR:
             self._start_evaluation()
 
     def _take_blocks(self, reports: list[BlockReport]) -> None:
@@ -250,7 +250,7 @@ class TrainingLoop:
         for worker in self._mender.workers:
             try:
                 self._take_blocks(self._mender.ask(worker, "settle"))
-            except PartFailed as failure:
+            except ComponentFailed as failure:
                 self._mend(failure)  # a new worker has nothing under way
 
     def _evaluates(self) -> bool:
@@ -284,10 +284,10 @@ class TrainingLoop:
         self.settle()
         try:
             self._saver.begin()
-        except PartFailed as failure:
+        except ComponentFailed as failure:
             self._mend(failure)
 
-    def _mend_if(self, failure: PartFailed | None) -> None:
+    def _mend_if(self, failure: ComponentFailed | None) -> None:
         if failure is not None:
             self._mend(failure)
 
@@ -296,7 +296,7 @@ class TrainingLoop:
         self._saver.restore(checkpoint)
         self._restored = True
 
-    def lost(self, failure: PartFailed) -> RunLost:
+    def lost(self, failure: ComponentFailed) -> RunLost:
         """Ends this attempt because of a failure outside of the rounds of training (see `run` for other errors)."""
         self._give_up()
         try:
@@ -309,7 +309,7 @@ class TrainingLoop:
         """The weights that the last update made.
 
         Raises:
-          PartFailed: they are gone with the learner.
+          ComponentFailed: they are gone with the learner.
         """
         weights: WeightsSnapshot = self._mender.ask(LEARNER, "weights")
         return weights

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from contextlib import closing
 from typing import NamedTuple
 
-from actors.evaluation.evaluator import evaluate_in_parts
+from actors.evaluation.evaluator import evaluate_in_parallel
 from actors.policy.network import WeightsSnapshot
-from actors.service.fault_policy import CallFailed, PartFailed, Recovery, RunFailed, first_line
+from actors.service.fault_policy import CallFailed, ComponentFailed, FaultTracker, RunFailed, first_line
 from actors.service.messages import EpisodeStats
 from actors.storage.uri import Location
 from learner.checkpoints.checkpoint import Checkpoint, check_config, check_state, newest_valid
@@ -157,7 +157,7 @@ def _train(
     place: Place,
 ) -> tuple[RunResult, list[Row]]:
     """Trains to the end, going back to the last checkpoint whenever a part is gone that only it can bring back."""
-    recovery, faults, say = Recovery(), FaultLog(folder.faults), _without_secrets(display, tracker)
+    recovery, faults, say = FaultTracker(), FaultLog(folder.faults), _without_secrets(display, tracker)
     incarnation = checkpoint.state["incarnation"] + 1 if checkpoint else 0
     resumed = checkpoint is not None
     monitor: Callable[[Row], None] | None = None
@@ -213,7 +213,7 @@ def _attempt(
     journal: Journal,
     cluster: Cluster,
     observer: MirroringObserver,
-    recovery: Recovery,
+    recovery: FaultTracker,
 ) -> RunResult:
     """Trains with one set of parts.
 
@@ -233,7 +233,7 @@ def _attempt(
             display.message(f"training done; evaluating {config.final_eval_episodes} greedy episodes")
             weights = loop.newest_weights()
             episodes = final_evaluation(config, cluster, weights)
-        except PartFailed as failure:  # outside of the rounds of training
+        except ComponentFailed as failure:  # outside of the rounds of training
             raise loop.lost(failure) from failure
         return RunResult(loop.env_steps, loop.updates, loop.saved, None, summarise(episodes), episodes, weights)
 
@@ -248,6 +248,6 @@ def final_evaluation(config: RunConfig, cluster: Cluster, weights: WeightsSnapsh
     seeds = list(range(first, first + config.final_eval_episodes))
     shared = cluster.calls.put(weights)
     try:
-        return evaluate_in_parts(cluster.calls, config.env, shared, seeds, cluster.eval_tasks)
+        return evaluate_in_parallel(cluster.calls, config.env, shared, seeds, cluster.eval_tasks)
     except CallFailed as failure:
         raise RunFailed(f"the evaluation at the end {failure.fault} again and again: {failure.reason}") from failure

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from actors.storage.uri import Location, as_location
+from actors.storage.uri import Location, parse_location
 from learner import file_names
 from learner.config import RunConfig, from_dict, to_dict
 from sim_core.checks import ConfigError, require
@@ -106,7 +106,7 @@ class RunFolder:
     def checkpoint_location(self) -> Location:
         """Where the run's checkpoints lie (see `storage` for errors)."""
         url = self.storage().checkpoint_url
-        return self.checkpoints if url is None else as_location(url)
+        return self.checkpoints if url is None else parse_location(url)
 
     def save_identity(self, identity: RunIdentity) -> None:
         """Writes `run.json`."""

@@ -1,4 +1,4 @@
-"""Packed transitions from whole ones, and back, the plain way."""
+"""Plain conversions between packed and unpacked transitions."""
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -8,7 +8,7 @@ from actors.service.packing import Packed, packed_dtype
 
 
 def pack(transitions, next_row=None):
-    """Packed rows; each leads to a frame of its own, but for those that `next_row` [count] gives a row ahead."""
+    """Packs transitions; each gets a frame, except where `next_row` `[count]` gives the distance to a row."""
     rows = np.zeros(len(transitions), packed_dtype(transitions.dtype))
     for name in ("reward", "discount", "action", "observation"):
         rows[name] = transitions[name]
@@ -19,14 +19,14 @@ def pack(transitions, next_row=None):
 
 
 def pack_as_collected(transitions, envs=64, n_step=3):
-    """Packed rows as a rollout worker makes them of running episodes; what a transition led to is not looked at."""
+    """Packs transitions as a rollout worker does while no episode ends; ignores most next observations."""
     ahead = np.full(len(transitions), envs * n_step)
     ahead[-envs * n_step :] = 0
     return pack(transitions, ahead)
 
 
 def as_rows(columns):
-    """Whole transitions of their columns."""
+    """Transitions `[count]` from their columns."""
     observation = columns["observation"]
     transitions = np.zeros(len(observation), transition_dtype(Box(-9, 9, observation.shape[1:], observation.dtype)))
     for name, column in columns.items():
@@ -35,11 +35,11 @@ def as_rows(columns):
 
 
 def unpack(packed, dtype):
-    """Whole transitions of `dtype`."""
+    """Unpacked transitions of `dtype`."""
     transitions = np.zeros(len(packed.rows), dtype)
     for name in ("reward", "discount", "action", "observation"):
         transitions[name] = packed.rows[name]
     for i, next_row in enumerate(packed.rows["next_row"].tolist()):
-        reached = packed.rows["observation"][i + next_row] if next_row > 0 else packed.frames[-next_row]
-        transitions["next_observation"][i] = reached
+        source = packed.rows["observation"][i + next_row] if next_row > 0 else packed.frames[-next_row]
+        transitions["next_observation"][i] = source
     return transitions

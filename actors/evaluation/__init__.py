@@ -1,1 +1,1 @@
-"""Greedy episodes, their statistics, and how they are stored."""
+"""Evaluation: greedy episodes on fixed seeds, their statistics, and their storage."""

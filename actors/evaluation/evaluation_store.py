@@ -1,4 +1,4 @@
-"""One evaluation in zarr: what played, in which world, and how each episode ended; never read back damaged."""
+"""One evaluation in zarr: what was evaluated, in which world, and how each episode ended; checked when it is read."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sim_core.checks import ConfigError, require
 from sim_core.config import WorldConfig
 
 FORMAT = "shoal-evaluation-1"
-EPISODE = np.dtype(
+EPISODE_DTYPE = np.dtype(
     [("seed", np.int64), ("outcome", np.int8), ("length_steps", np.int32), ("episode_return", np.float64)]
 )
 
@@ -28,30 +28,31 @@ EPISODE = np.dtype(
 class StoredEvaluation(NamedTuple):
     """An evaluation as it is stored.
 
-    `spec` is where it was played; `player` a run's name or a baseline's; `updates` the number of updates behind the
-    policy, 0 for a baseline; `seed` `[episodes]` int64 the episodes' seeds, in the order of `stats`.
+    `spec` is the environment, `candidate` the name of a run or a baseline, and `updates` the number of updates applied
+    to the policy's weights, 0 for a baseline. `seed` `[episodes]` int64 holds the episodes' seeds in the order of
+    `stats`.
     """
 
     spec: EnvSpec
-    player: str
+    candidate: str
     updates: int
     seed: NDArray[np.int64]
     stats: EpisodeStats
 
 
 def refuse_existing(path: Path) -> None:
-    """Raises ConfigError where something is at `path`: results are not overwritten."""
+    """Raises ConfigError if something exists at `path`, since results are never overwritten."""
     require(not path.exists(), f"{path} exists and is not overwritten; name another file or remove it")
 
 
 def save_evaluation(path: Path, evaluation: StoredEvaluation) -> None:
-    """Writes a new zarr group at `path`, which appears once it is whole.
+    """Writes a new zarr group at `path`, which appears once it is complete.
 
     Raises:
-      ConfigError: something is at `path`.
+      ConfigError: something exists at `path`.
     """
     refuse_existing(path)
-    rows = np.zeros(len(evaluation.seed), EPISODE)
+    rows = np.zeros(len(evaluation.seed), EPISODE_DTYPE)
     rows["seed"] = evaluation.seed
     for name, column in evaluation.stats._asdict().items():
         rows[name] = column
@@ -61,7 +62,7 @@ def save_evaluation(path: Path, evaluation: StoredEvaluation) -> None:
     header: dict[str, Any] = {
         "env_id": evaluation.spec.env_id,
         "world": dataclasses.asdict(evaluation.spec.world),
-        "player": evaluation.player,
+        "player": evaluation.candidate,
         "updates": evaluation.updates,
     }
     zarr.open_group(str(part), mode="r+").attrs.update({"header": header, "header_crc32": _crc32(header)})
@@ -72,9 +73,9 @@ def load_evaluation(path: Path) -> StoredEvaluation:
     """Reads what `save_evaluation` wrote.
 
     Raises:
-      ValueError: the group is missing, damaged, or something else.
+      ValueError: the group is missing or damaged, or is no evaluation.
     """
-    rows = load_rows(path, EPISODE, FORMAT)
+    rows = load_rows(path, EPISODE_DTYPE, FORMAT)
     attributes: Any = open_store(path).attrs.asdict()
     header = attributes.get("header")
     if header is None or _crc32(header) != attributes.get("header_crc32"):

@@ -1,6 +1,6 @@
-"""Evaluation on fixed seeds: one episode a seed, so that short episodes are not over-counted.
+"""Evaluation on fixed seeds: one episode per seed, so that short episodes are not over-represented.
 
-Learned policies, which act greedily, and baselines are played by the same loop.
+The same loop plays learned policies, which act greedily, and baselines.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from actors.policy.baselines import ActionRule, Baseline, make_baseline
 from actors.policy.network import Policy, WeightsSnapshot
 from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
 from actors.rollout.worker import join_stats
-from actors.service.fault_policy import Action, CallFailed, PartKind, decide
+from actors.service.fault_policy import Action, CallFailed, ComponentKind, decide
 from actors.service.messages import NO_OUTCOME, EpisodeStats
 from actors.service.rpc import Calls, Ref
 from sim_core.checks import require
@@ -26,14 +26,14 @@ from sim_core.outcomes import Outcome
 from sim_core.worlds import WorldBatch, is_done
 
 MAX_ENVS = 250
-"""Environments stepped at once."""
+"""Most environments stepped together."""
 
 Candidate = WeightsSnapshot | Baseline
-"""What is evaluated, as data that travels to where it plays: a learned policy's weights, or a baseline's name."""
+"""What is evaluated, as data that can be sent to another process: a policy's weights, or a baseline's name."""
 
 
 class GreedyPolicy:
-    """A learned policy that takes the action of the highest value; implements `actors.policy.baselines.ActionRule`.
+    """A learned policy that takes the action of the highest value; implements `baselines.ActionRule`.
 
     Args:
       weights: the snapshot to act with.
@@ -43,27 +43,27 @@ class GreedyPolicy:
         self._policy = Policy(weights)
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.int64]:
-        """Best actions `[batch]`; the lowest index among equals."""
+        """Greedy actions `[batch]` for observations `[batch, *shape]`; the lowest index among equals."""
         return self._policy.greedy(observation)
 
 
 def make_action_rule(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> ActionRule:
-    """What chooses the candidate's actions in one episode a seed, all played at once.
+    """Makes the action rule of a candidate for one episode per seed, all played together.
 
     Raises:
-      ConfigError: a baseline is to play in an environment that is not ours.
+      ConfigError: the candidate is a baseline and the environment is not the swarm's.
     """
     if isinstance(candidate, WeightsSnapshot):
         return GreedyPolicy(candidate)
-    require(spec.is_swarm, f"the baseline {candidate} plays in our own environment only, not in {spec.env_id}")
+    require(spec.is_swarm, f"the baseline {candidate} plays in the swarm environment only, not in {spec.env_id}")
     return make_baseline(candidate, spec.world, seeds)
 
 
 def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> EpisodeStats:
-    """Plays one episode from each seed.
+    """Plays one episode per seed.
 
     Returns:
-      One entry a seed, in order.
+      One entry per seed, in order.
 
     Raises:
       ConfigError: see `make_action_rule`.
@@ -72,37 +72,44 @@ def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> EpisodeSt
     return join_stats([_play(spec, make_action_rule(spec, candidate, chunk), chunk) for chunk in chunks])
 
 
-def evaluate_in_parts(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: list[int], parts: int) -> EpisodeStats:
-    """`evaluate` as up to `parts` calls at once; `candidate` refers to a Candidate.
+def evaluate_in_parallel(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: list[int], max_calls: int) -> EpisodeStats:
+    """Splits an evaluation into up to `max_calls` simultaneous calls of `evaluate`.
+
+    Args:
+      calls: how to start the calls.
+      spec: the environment.
+      candidate: reference to a Candidate.
+      seeds: one episode is played per seed.
+      max_calls: most calls to start.
 
     Returns:
-      One entry a seed, in order.
+      One entry per seed, in order.
 
     Raises:
-      CallFailed: one of the calls fails again and again.
+      CallFailed: one of the calls keeps failing.
     """
-    parts = min(parts, len(seeds))
-    bounds = [len(seeds) * i // parts for i in range(parts + 1)] if parts else []
+    num_calls = min(max_calls, len(seeds))
+    bounds = [len(seeds) * i // num_calls for i in range(num_calls + 1)] if num_calls else []
     chunks = [seeds[begin:end] for begin, end in pairwise(bounds)]
     refs = [calls.run(evaluate, spec, candidate, chunk) for chunk in chunks]
-    return join_stats([_played(calls, spec, candidate, *call) for call in zip(chunks, refs, strict=True)])
+    return join_stats([_get_result(calls, spec, candidate, *call) for call in zip(chunks, refs, strict=True)])
 
 
-def _played(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: list[int], ref: Ref) -> EpisodeStats:
-    """What a call of `evaluate` gave; it is made again as long as the decision table says so."""
+def _get_result(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: list[int], ref: Ref) -> EpisodeStats:
+    """Waits for a call of `evaluate`, and makes it again as long as the decision table says so."""
     for attempt in count(1):
         try:
             stats: EpisodeStats = calls.get(ref)
             return stats
         except CallFailed as failure:
-            if decide(PartKind.EVALUATOR, failure.fault, attempt, 0.0) is Action.STOP:
+            if decide(ComponentKind.EVALUATOR, failure.fault, attempt, 0.0) is Action.STOP:
                 raise
             ref = calls.run(evaluate, spec, candidate, seeds)
     raise AssertionError("count never ends")
 
 
 class _Step(NamedTuple):
-    """What a step of every episode gave `[batch, ...]`; `outcome` is of those that ended."""
+    """Result of stepping every episode `[batch, ...]`; `outcome` is valid where an episode has ended."""
 
     observation: NDArray[Any]
     reward: NDArray[np.float64]
@@ -110,14 +117,14 @@ class _Step(NamedTuple):
     outcome: NDArray[np.int8]
 
 
-class _Worlds:
-    """Our own worlds, which FL-ORCA may drive; once half of them have ended, those that run go on alone."""
+class _SwarmEpisodes:
+    """Episodes of the swarm environment; once half of the worlds have ended, only the others are stepped."""
 
     def __init__(self, config: WorldConfig, seeds: list[int]) -> None:
         self._worlds = WorldBatch(config, len(seeds))
         self._worlds.seed(seeds)
-        self._episode = np.arange(len(seeds))  # of every world that is still stepped
-        self._over = np.zeros(len(seeds), np.bool_)  # those that have ended among them
+        self._episode = np.arange(len(seeds))  # index of the episode of every world that is still stepped
+        self._over = np.zeros(len(seeds), np.bool_)  # which of these worlds have ended
         self._last = _Step(
             observation=self._worlds.reset(),
             reward=np.zeros(len(seeds)),
@@ -138,10 +145,10 @@ class _Worlds:
         last.outcome[episode] = result.outcome
         self._over |= done
         if self._over.mean() >= 0.5 and not self._over.all():
-            self._leave_ended()
+            self._drop_ended()
         return self._last
 
-    def _leave_ended(self) -> None:
+    def _drop_ended(self) -> None:
         running = ~self._over
         state = {name: array[running] for name, array in self._worlds.get_state().items()}
         self._episode = self._episode[running]
@@ -153,8 +160,8 @@ class _Worlds:
         pass
 
 
-class _Environments:
-    """Environments of any Gymnasium id; ended ones restart, and their next episodes count for nothing."""
+class _GymEpisodes:
+    """Episodes of any Gymnasium id; environments restart when they end, and those further episodes are ignored."""
 
     def __init__(self, spec: EnvSpec, seeds: list[int]) -> None:
         self._env = make_vector_env(spec, len(seeds))
@@ -177,22 +184,22 @@ class _Environments:
 def _play(spec: EnvSpec, rule: ActionRule, seeds: list[int]) -> EpisodeStats:
     count = len(seeds)
     stats = EpisodeStats(np.full(count, NO_OUTCOME, np.int8), np.zeros(count, np.int32), np.zeros(count))
-    stage = _Worlds(spec.world, seeds) if spec.is_swarm else _Environments(spec, seeds)
-    observation = stage.start()
+    episodes = _SwarmEpisodes(spec.world, seeds) if spec.is_swarm else _GymEpisodes(spec, seeds)
+    observation = episodes.start()
     running = np.ones(count, np.bool_)
     while running.any():
-        observation, reward, done, outcome = stage.step(rule.act(observation))
+        observation, reward, done, outcome = episodes.step(rule.act(observation))
         stats.length_steps[running] += 1
         stats.episode_return[running] += reward[running]
         ended = running & done
         stats.outcome[ended] = outcome[ended]
         running &= ~ended
-    stage.close()
+    episodes.close()
     return stats
 
 
 def record_episode(spec: EnvSpec, candidate: Candidate, seed: int) -> Episode:
-    """Plays one episode of our own environment and keeps every state."""
+    """Plays one episode of the swarm environment and records every state."""
     worlds = WorldBatch(spec.world, 1)
     rule = make_action_rule(spec, candidate, [seed])
     worlds.seed([seed])
@@ -221,10 +228,10 @@ def record_episode(spec: EnvSpec, candidate: Candidate, seed: int) -> Episode:
 
 
 def record_frames(spec: EnvSpec, weights: WeightsSnapshot, seed: int) -> tuple[list[NDArray[np.uint8]], float]:
-    """Plays one greedy episode of any Gymnasium environment and keeps its images.
+    """Plays one greedy episode of any Gymnasium environment and records its images.
 
     Returns:
-      (images `[height, width, 3]`, images per second); no images where the environment has no rgb_array mode.
+      (images `[height, width, 3]` uint8, images per second); no images if the environment has no `rgb_array` mode.
     """
     policy = Policy(weights)
     try:

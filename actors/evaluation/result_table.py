@@ -1,7 +1,7 @@
-"""The results of a sweep as a table: one row a policy and a setup that it was played in.
+"""The results of a sweep as a table: one row per policy and setup in which it was evaluated.
 
-The table is what a report is made from and what is committed: a CSV file that anyone can read, counts instead of
-rates, a few dozen bytes a row.
+Reports are made from this table, and it is committed: a CSV file that anyone can read, with counts in place of rates,
+and a few dozen bytes per row.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ ROBOTS = (5, 10, 15, 20, 25)
 GROUPS = (1, 2, 3, 4, 8)
 """Group counts of the dissertation's setups (3.3)."""
 LEARNED = "learned"
-"""`policy` of a trained network; baselines go by their own names."""
+"""`policy` of a trained network; a baseline's is its name."""
 
 
 class ResultRow(NamedTuple):
     """Counts of one evaluation.
 
-    Fields: preset, and policy (`learned`, or a baseline's name); method whose world it was played in; the setup and
-    seed it was trained with (a baseline's: the setup it was played in, seed 0); the setup it was played in;
-    episodes, and how many ended in each outcome; mean length in env steps; hash of the run's config.
+    Fields: preset; policy (`learned`, or a baseline's name); method, which determines the world; robots per group,
+    groups and seed of the training (for a baseline: those of the evaluation, and seed 0); robots per group and groups
+    of the evaluation; episodes, and how many ended in each outcome; mean length in env steps; hash of the run's config.
     """
 
     preset: str
@@ -49,12 +49,12 @@ class ResultRow(NamedTuple):
     config: str
 
     def count(self, outcome: Outcome) -> int:
-        """Episodes that ended in `outcome`."""
+        """Number of episodes that ended in `outcome`."""
         return int(getattr(self, outcome.name.lower()))
 
     @property
     def is_fixed(self) -> bool:
-        """Whether it was played in the setup it was trained in (Fixed), else it is an Extrapolation."""
+        """Whether training and evaluation have the same setup (Fixed); otherwise it is an Extrapolation."""
         return (self.trained_robots, self.trained_groups) == (self.robots, self.groups)
 
 
@@ -62,7 +62,7 @@ _TYPES: dict[str, Any] = get_type_hints(ResultRow)
 
 
 def write_table(path: Path, rows: Iterable[ResultRow]) -> None:
-    """Writes rows in a fixed order to a CSV file; an older one is replaced once the new is whole."""
+    """Writes rows in a fixed order to a CSV file; an older file is replaced once the new one is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
     with part.open("w", newline="", encoding="utf-8") as file:
@@ -78,7 +78,7 @@ def read_table(path: Path) -> list[ResultRow]:
     """Reads what `write_table` wrote.
 
     Raises:
-      ConfigError: the file cannot be read, has other columns, or a row whose counts cannot be.
+      ConfigError: the file cannot be read, has other columns, or has a row with impossible counts.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:

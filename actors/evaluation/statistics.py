@@ -1,4 +1,4 @@
-"""Rates and means with their 95 % confidence intervals."""
+"""Rates, ratios and means with 95 % confidence intervals."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ class Estimate(NamedTuple):
 
 
 def dispersion(samples: Iterable[Sequence[tuple[int, int]]], freedom: float = math.inf) -> float:
-    """How many times as much counts vary as binomial ones: Pearson's estimate (McCullagh and Nelder 1989, 4.5.2).
+    """Estimates the dispersion factor of counts: their variance over the binomial one.
 
-    It is taken for the counts of several samples that share it, and larger by the square of Student's quantile over the
-    normal one, since it is an estimate itself.
+    This is Pearson's estimate (McCullagh and Nelder 1989, 4.5.2), pooled over samples that share the factor. Because
+    the factor is itself an estimate, it is multiplied by the squared ratio of Student's quantile to the normal one.
 
     Args:
-      samples: the samples, each several (count, total) of one share; those of one pair, or whose counts are all 0 or
-        all whole, tell nothing.
-      freedom: at most so many degrees of freedom, where pairs of different samples depend on each other.
+      samples: samples of several (count, total) pairs each, with one rate per sample. A sample of a single pair, or
+        whose rate is 0 or 1, is ignored.
+      freedom: upper limit on the degrees of freedom, for pairs that depend on each other across samples.
 
     Returns:
-      The factor, at least 1; 1 if nothing tells of it.
+      The factor, at least 1; exactly 1 if no sample has information about it.
     """
     chi_square, found = 0.0, 0
     for pairs in samples:
@@ -52,21 +52,21 @@ Z = _quantile(math.inf)
 
 
 def as_percent(share: Estimate) -> str:
-    """`89.8 % (87.8 … 91.5)`."""
+    """Formats a rate with its interval, such as `89.8 % (87.8 … 91.5)`."""
     value, low, high = (100 * number for number in share)
     return f"{value:.1f} % ({low:.1f} … {high:.1f})"
 
 
 def rate(count: int, total: int, spread: float = 1.0) -> Estimate:
-    """Share of successes with its Wilson interval (Wilson 1927).
+    """Success rate with its score interval (Wilson 1927).
 
     Args:
-      count: successes.
-      total: trials.
-      spread: so many trials are worth one, where counts vary more than binomial ones; see `dispersion`.
+      count: number of successes.
+      total: number of trials.
+      spread: dispersion factor of the counts (see `dispersion`); the interval is that of `total / spread` trials.
 
     Raises:
-      ValueError: there are no trials, or more successes.
+      ValueError: there are no trials, or more successes than trials.
     """
     if total < 1 or not 0 <= count <= total:
         raise ValueError(f"a rate needs trials, and at most as many successes, not {count} of {total}")
@@ -78,42 +78,30 @@ def rate(count: int, total: int, spread: float = 1.0) -> Estimate:
 
 
 def ratio(samples: Sequence[Sequence[tuple[int, int]]]) -> Estimate:
-    """Share of all counts in all totals, where totals vary too; samples are strata (Cochran 1977, 6.11).
+    """Ratio of all counts to all totals where the totals vary too: the combined ratio estimator (Cochran 1977, 6.11).
 
     Args:
-      samples: each several (count, total) of one kind, such as one a training seed; at least one total is not 0.
+      samples: strata of (count, total) pairs, such as one pair per training seed; not all totals are 0.
 
     Returns:
-      The share with its 95 % interval: Student's over the pairs of each sample, or Wilson's if that is wider.
+      The ratio with its 95 % interval: Student's t interval over the pairs of each stratum, or Wilson's if that is
+      wider.
     """
     count, total = (sum(pair[i] for pairs in samples for pair in pairs) for i in (0, 1))
     binomial = rate(count, total)
     variance, freedom = 0.0, 0
     for pairs in samples:
-        left = np.array([part - binomial.value * whole for part, whole in pairs])
-        if len(left) > 1:
-            variance += len(left) * float(np.var(left, ddof=1))
-            freedom += len(left) - 1
+        residuals = np.array([pair[0] - binomial.value * pair[1] for pair in pairs])
+        if len(residuals) > 1:
+            variance += len(residuals) * float(np.var(residuals, ddof=1))
+            freedom += len(residuals) - 1
     half = _quantile(freedom) * math.sqrt(variance) / total if freedom else 0.0
     low, high = min(binomial.low, max(binomial.value - half, 0.0)), max(binomial.high, min(binomial.value + half, 1.0))
     return Estimate(binomial.value, low, high)
 
 
-def rate_difference(first: tuple[int, int], second: tuple[int, int]) -> Estimate:
-    """Rate of `first` less that of `second`, each (count, total), with Newcombe's interval (1998, method 10).
-
-    Raises:
-      ValueError: one of them has no trials.
-    """
-    one, two = rate(*first), rate(*second)
-    value = one.value - two.value
-    low = value - float(np.hypot(one.value - one.low, two.high - two.value))
-    high = value + float(np.hypot(one.high - one.value, two.value - two.low))
-    return Estimate(value, low, high)
-
-
 def mean(values: np.ndarray) -> Estimate:
-    """Mean with its Student t interval; the interval is the value where it has no width."""
+    """Mean of `values` `[count]` with its Student t interval, which has width 0 for a single value."""
     centre = float(np.mean(values))
     if len(values) < 2:
         return Estimate(centre, centre, centre)

@@ -1,6 +1,7 @@
-"""Recorded episodes in zarr, in the layout that robotics users know from diffusion_policy.
+"""Recorded episodes in zarr, in the layout of diffusion_policy, which robotics users know.
 
-`data/<key>` is time-major over all episodes one after the other; `meta/episode_ends` says where each ends.
+`data/<key>` holds the states of all episodes one after the other, time first; `meta/episode_ends` holds where each
+ends.
 """
 
 from __future__ import annotations
@@ -19,15 +20,16 @@ from sim_core.config import WorldConfig
 
 FORMAT = "shoal-trajectories-1"
 NO_ACTION = -1
-"""Action of a step that FL-ORCA drove, and of the ended state."""
+"""Action of a step in which FL-ORCA drove the learning robot, and of the final state."""
 
 
 class Episode(NamedTuple):
-    """One recorded episode of T env steps: T + 1 states, from the start to the ended one.
+    """One recorded episode of T env steps: T + 1 states, from the first to the final one.
 
-    Shapes: position, velocity `[T + 1, num_robots, 2]` float32 (metres, m/s); machine `[T + 1, num_robots]`
-    int8 (sim_core.swarm.flock_rules.STATE_NAMES); action `[T + 1]` int64 and reward `[T + 1]` float32, taken in and
-    received for the state of the same row (last row: NO_ACTION and 0); goal `[groups, 2]` float32.
+    Shapes: position, velocity `[T + 1, num_robots, 2]` float32 (metres, m/s); machine, the state of FL-ORCA's state
+    machine, `[T + 1, num_robots]` int8 (sim_core.swarm.flock_rules.STATE_NAMES); action `[T + 1]` int64, taken in the
+    state of the same row, and reward `[T + 1]` float32, received for it (final row: NO_ACTION and 0); goal `[groups,
+    2]` float32 (metres). `learner` is the index of the learning robot.
     """
 
     position: NDArray[np.float32]
@@ -45,7 +47,7 @@ TIME_KEYS = ("position", "velocity", "machine", "action", "reward")
 
 
 def save_episodes(path: Path, episodes: list[Episode], config: WorldConfig) -> None:
-    """Writes episodes of one setup to a new zarr group at `path`; an older one there is replaced once the new is whole.
+    """Writes episodes of one setup to a zarr group at `path`; an older one is replaced once the new one is complete.
 
     Raises:
       ValueError: there are no episodes.
@@ -71,7 +73,7 @@ def load_episodes(path: Path) -> tuple[list[Episode], WorldConfig]:
     """Reads what `save_episodes` wrote.
 
     Raises:
-      ValueError: `path` holds something else.
+      ValueError: `path` does not hold complete recorded episodes of this format.
     """
     try:
         root = open_store(path)

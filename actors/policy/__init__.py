@@ -1,1 +1,1 @@
-"""What chooses actions: the Q-network as a policy, and rules that learn nothing."""
+"""Action selection: the Q-network as a policy, and baselines that do not learn."""

@@ -1,4 +1,4 @@
-"""A multilayer perceptron in numba: what acts and what learns on the CPU compute alike, at BLAS's speed."""
+"""A multilayer perceptron in numba, at the speed of BLAS; rollout workers and the learner on the CPU share it."""
 
 from __future__ import annotations
 
@@ -13,42 +13,42 @@ Floats = NDArray[np.float32]
 
 
 class Layers(NamedTuple):
-    """Weights `[fan_out, fan_in]` and biases `[fan_out]` of all layers, float32."""
+    """Weights `[fan_out, fan_in]` and biases `[fan_out]` of every layer, float32."""
 
     weights: tuple[Floats, ...]
     biases: tuple[Floats, ...]
 
 
-def make_room(count: int, layers: Layers) -> tuple[Floats, ...]:
-    """Memory for `count` observations: them, the hidden layers and the action values, `[count, width]` each."""
+def make_workspace(count: int, layers: Layers) -> tuple[Floats, ...]:
+    """Arrays `[count, width]` float32 for a batch of `count`: observations, hidden layers, action values."""
     widths = [layers.weights[0].shape[1], *(len(bias) for bias in layers.biases)]
     return tuple(np.zeros((count, width), np.float32) for width in widths)
 
 
 @inlined_blas
 def multiply(a: Floats, b: Floats, out: Floats) -> None:
-    """The matrix product a b, written to `out`."""
+    """Writes the matrix product a b to `out`."""
     np.dot(a, b, out)
 
 
 @inlined_blas
 def squared_norm(x: Floats) -> Any:
-    """The scalar product of x with itself."""
+    """Squared Euclidean norm of the vector x."""
     return np.dot(x, x)
 
 
 @inlined
-def forward(layers: Layers, room: tuple[Floats, ...]) -> None:
-    """Computes all layers, ReLU between them, from the observations in `room[0]`."""
+def forward(layers: Layers, workspace: tuple[Floats, ...]) -> None:
+    """Computes all layers, with ReLU between them, from the observations in `workspace[0]` (see `make_workspace`)."""
     last = len(layers.weights) - 1
     for i in range(last + 1):
-        multiply(room[i], layers.weights[i].T, room[i + 1])
-        _shift(room[i + 1], layers.biases[i], i < last)
+        multiply(workspace[i], layers.weights[i].T, workspace[i + 1])
+        _add_bias(workspace[i + 1], layers.biases[i], i < last)
 
 
 @inlined
-def _shift(x: Floats, bias: Floats, rectify: bool) -> None:
-    """Adds the bias in place; if it rectifies, what is below 0 becomes 0, and NaN stays NaN."""
+def _add_bias(x: Floats, bias: Floats, rectify: bool) -> None:
+    """Adds `bias` `[width]` to `x` `[batch, width]` in place, then applies ReLU if `rectify`; NaN stays NaN."""
     zero = np.float32(0)
     for row in range(x.shape[0]):
         for column in range(x.shape[1]):
@@ -57,8 +57,8 @@ def _shift(x: Floats, bias: Floats, rectify: bool) -> None:
 
 
 @inlined
-def best_of(values: Floats, row: int) -> Any:
-    """The best action of a row `[batch, actions]`; the lowest index among equals."""
+def best_action(values: Floats, row: int) -> Any:
+    """Action of the highest value in a row of `values` `[batch, actions]`; the lowest index among equals."""
     best = 0
     for action in range(1, values.shape[1]):
         if values[row, action] > values[row, best]:

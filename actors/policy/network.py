@@ -1,7 +1,7 @@
-"""The Q-network: in torch, and compiled where it acts.
+"""The Q-network: in torch for learning, as a compiled kernel for acting.
 
-A rollout worker's batches are small, where a compiled kernel is several times faster than torch; both compute the same
-function (tested).
+For the small batches of a rollout worker, a compiled kernel is several times faster than torch. A test checks that both
+compute the same function.
 """
 
 from __future__ import annotations
@@ -13,14 +13,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from actors.policy.mlp_kernels import Floats, Layers, best_of, forward, make_room
+from actors.policy.mlp_kernels import Floats, Layers, best_action, forward, make_workspace
 from sim_core.jit import kernel
 
 
 class WeightsSnapshot(NamedTuple):
-    """A published policy: weights and biases of each layer of a plain network in turn, float32.
+    """A published policy.
 
-    `version` is the number of updates behind it, `time_s` the wall time of its publication.
+    `version` is the number of updates applied to the weights, `time_s` the wall time of their publication. `arrays`
+    holds the weights `[fan_out, fan_in]` and biases `[fan_out]` of a plain network, layer by layer.
     """
 
     version: int
@@ -29,7 +30,7 @@ class WeightsSnapshot(NamedTuple):
 
 
 class QNetwork(nn.Module):
-    """A multilayer perceptron with ReLU, observations `[batch, *shape]` to action values `[batch, actions]`.
+    """A multilayer perceptron with ReLU: observations `[batch, *shape]` to action values `[batch, actions]`.
 
     Args:
       observation_size: number of elements of one observation.
@@ -52,14 +53,14 @@ class QNetwork(nn.Module):
 
 
 class DuelingNetwork(nn.Module):
-    """A Q-network of two streams, Q(s, a) = V(s) + A(s, a) - mean over a' of A(s, a').
+    """A dueling Q-network: Q(s, a) = V(s) + A(s, a) - mean over a' of A(s, a').
 
-    Z. Wang et al., "Dueling network architectures for deep reinforcement learning" (ICML 2016), Equation 9. All hidden
-    layers but the last are shared; the last one is two, a stream's each. They lie in one matrix, V's half first.
+    Z. Wang et al., "Dueling network architectures for deep reinforcement learning" (ICML 2016), Equation 9. The two
+    streams share all hidden layers but the last. Their last hidden layers are stored as one, V's half first.
 
     Args:
       observation_size: number of elements of one observation.
-      hidden_sizes: width of every hidden layer; the last is that of each stream.
+      hidden_sizes: width of every hidden layer; the last one is the width per stream.
       num_actions: number of actions.
     """
 
@@ -85,11 +86,14 @@ class DuelingNetwork(nn.Module):
 NETWORKS: dict[str, type[QNetwork] | type[DuelingNetwork]] = {"plain": QNetwork, "dueling": DuelingNetwork}
 
 
-def folded_head(value: tuple[Tensor, Tensor], advantage: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """The one linear layer that a dueling network's head is: weight `[actions, 2 width]`, bias `[actions]`.
+def fold_dueling_head(value: tuple[Tensor, Tensor], advantage: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Folds the output layers of a dueling network into one linear layer that computes the same action values.
 
     Args:
-      value, advantage: (weight, bias) of either stream's last layer.
+      value, advantage: (weight, bias) of the output layer of each stream.
+
+    Returns:
+      (weight `[actions, 2 * width]`, bias `[actions]`).
     """
     (value_weight, value_bias), (weight, bias) = value, advantage
     centred = weight - weight.mean(dim=0)
@@ -97,33 +101,33 @@ def folded_head(value: tuple[Tensor, Tensor], advantage: tuple[Tensor, Tensor]) 
 
 
 def snapshot(network: QNetwork | DuelingNetwork, version: int, time_s: float) -> WeightsSnapshot:
-    """Copies the network's parameters out; a dueling network's as those of the plain network that it equals."""
+    """Copies the parameters of a network; those of a dueling network as the plain network that it is equal to."""
     parameters = [parameter.detach() for parameter in network.parameters()]
     if isinstance(network, DuelingNetwork):
         *parameters, value_weight, value_bias, weight, bias = parameters
-        parameters += folded_head((value_weight, value_bias), (weight, bias))
+        parameters += fold_dueling_head((value_weight, value_bias), (weight, bias))
     arrays = tuple(parameter.cpu().numpy().copy() for parameter in parameters)
     return WeightsSnapshot(version, time_s, arrays)
 
 
 def load_snapshot(network: QNetwork, weights: WeightsSnapshot) -> None:
-    """Copies a snapshot's parameters into the network.
+    """Copies the parameters of a snapshot into a network.
 
     Raises:
-      ValueError: the snapshot is of a network of another shape.
+      ValueError: the snapshot's network has another shape.
     """
     parameters = list(network.parameters())
     if [tuple(parameter.shape) for parameter in parameters] != [array.shape for array in weights.arrays]:
         raise ValueError("the saved weights are of a network of another shape")
     with torch.no_grad():
         for parameter, array in zip(parameters, weights.arrays, strict=True):
-            parameter.copy_(torch.tensor(array))  # a copy: what Ray gives cannot be written to
+            parameter.copy_(torch.tensor(array))  # a copy, since arrays from Ray are read-only
 
 
 class Policy:
-    """Action values from published weights, compiled.
+    """The compiled policy of a weights snapshot.
 
-    Layers lie in memory that is kept between calls: to ask for it anew costs as much as what is written to it.
+    The workspace is kept between calls, since allocating it takes as long as filling it.
 
     Args:
       weights: the snapshot to act with.
@@ -131,37 +135,37 @@ class Policy:
 
     def __init__(self, weights: WeightsSnapshot) -> None:
         self.weights = weights
-        copies = [array.copy() for array in weights.arrays]  # what Ray gives is read-only, another type to numba
+        copies = [array.copy() for array in weights.arrays]  # arrays from Ray are read-only: another numba type
         self._layers = Layers(tuple(copies[::2]), tuple(copies[1::2]))
-        self._room = make_room(0, self._layers)
+        self._workspace = make_workspace(0, self._layers)
 
     def values(self, observation: NDArray[np.generic]) -> NDArray[np.float32]:
-        """Action values `[batch, actions]` of observations `[batch, *shape]`."""
-        self._see(observation)
-        _values(self._layers, self._room)
-        return self._room[-1].copy()
+        """Action values `[batch, actions]` float32 of observations `[batch, *shape]`."""
+        self._load(observation)
+        _values(self._layers, self._workspace)
+        return self._workspace[-1].copy()
 
     def greedy(self, observation: NDArray[np.generic]) -> NDArray[np.int64]:
-        """Best actions `[batch]`; the lowest index among equals."""
-        self._see(observation)
+        """Greedy actions `[batch]` for observations `[batch, *shape]`; the lowest index among equals."""
+        self._load(observation)
         actions = np.empty(len(observation), np.int64)
-        _greedy(self._layers, self._room, actions)
+        _greedy(self._layers, self._workspace, actions)
         return actions
 
-    def _see(self, observation: NDArray[np.generic]) -> None:
+    def _load(self, observation: NDArray[np.generic]) -> None:
         count = len(observation)
-        if len(self._room[0]) != count:
-            self._room = make_room(count, self._layers)
-        self._room[0][...] = observation.reshape(count, -1)
+        if len(self._workspace[0]) != count:
+            self._workspace = make_workspace(count, self._layers)
+        self._workspace[0][...] = observation.reshape(count, -1)
 
 
 @kernel
-def _values(layers: Layers, room: tuple[Floats, ...]) -> None:
-    forward(layers, room)
+def _values(layers: Layers, workspace: tuple[Floats, ...]) -> None:
+    forward(layers, workspace)
 
 
 @kernel
-def _greedy(layers: Layers, room: tuple[Floats, ...], actions: NDArray[np.int64]) -> None:
-    forward(layers, room)
+def _greedy(layers: Layers, workspace: tuple[Floats, ...], actions: NDArray[np.int64]) -> None:
+    forward(layers, workspace)
     for row in range(len(actions)):
-        actions[row] = best_of(room[-1], row)
+        actions[row] = best_action(workspace[-1], row)

@@ -1,1 +1,1 @@
-"""The sharded replay buffer."""
+"""Replay shards, with uniform or prioritised sampling."""

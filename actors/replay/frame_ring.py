@@ -1,4 +1,4 @@
-"""The frames of a replay shard: observations that its rows led to and that no row of it begins with."""
+"""Ring of a replay shard's frames: next observations that are not the observation of any row (see `packing`)."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from actors.service.packing import as_bytes
 from actors.storage.ring_snapshot import RingSnapshot
 from actors.storage.zarr_columns import load_rows
 
-SMALLEST = 1_024
-"""Frames that there is room for at first."""
-LAST = 2**62
-"""No number of a frame is greater."""
+MIN_CAPACITY = 1_024
+"""Capacity of a new ring."""
+MAX_NUMBER = 2**62
+"""Upper bound on the number of a frame."""
 
 
 class FrameRing:
-    """Frames in the order that they came, until they are released in the same order; grows when it is full.
+    """A first-in, first-out ring of frames that doubles its capacity when it is full.
 
-    Frame k stands at k modulo the capacity, a power of 2.
+    Frames are numbered in the order of insertion; frame k is in slot k modulo the capacity, a power of 2.
 
     Args:
-      observation: dtype and shape of one frame, as `np.dtype` has them in one.
+      observation: dtype of one frame, its shape included.
     """
 
     def __init__(self, observation: np.dtype[Any]) -> None:
         self._dtype = np.dtype([("observation", observation)])
-        self._ring = np.zeros(SMALLEST, self._dtype)
+        self._ring = np.zeros(MIN_CAPACITY, self._dtype)
         self._first = 0
         self._next = 0
         self._snapshot = RingSnapshot(self._ring, 0)
 
     @property
-    def frames(self) -> NDArray[Any]:
-        """All places, `[capacity]`."""
+    def slots(self) -> NDArray[Any]:
+        """All slots `[capacity]`, used and free, with the one field `observation`."""
         return self._ring
 
     @property
@@ -45,13 +45,13 @@ class FrameRing:
         return range(self._first, self._next)
 
     def release(self, count: int) -> None:
-        """Gives the places of the oldest `count` frames back."""
+        """Frees the slots of the oldest `count` frames."""
         self._first += count
 
     def push(self, frames: NDArray[Any]) -> int:
-        """Takes frames `[count, *shape]` of the ring's dtype; returns the number of the first one."""
+        """Inserts frames `[count, *shape]` of the ring's dtype; returns the number of the first one."""
         number = self._next
-        self._make_room(self._next - self._first + len(frames))
+        self._grow(self._next - self._first + len(frames))
         self._write(number, as_bytes(frames))
         self._next += len(frames)
         return number
@@ -59,12 +59,12 @@ class FrameRing:
     def _write(self, number: int, frames: NDArray[np.uint8]) -> None:
         start, memory = number % len(self._ring), as_bytes(self._ring)
         first = min(len(frames), len(self._ring) - start)
-        for begin, part in ((start, frames[:first]), (0, frames[first:])):
-            self._snapshot.protect(begin, begin + len(part))
-            memory[begin : begin + len(part)] = part
+        for begin, piece in ((start, frames[:first]), (0, frames[first:])):
+            self._snapshot.protect(begin, begin + len(piece))
+            memory[begin : begin + len(piece)] = piece
 
-    def _make_room(self, count: int) -> None:
-        """Doubles the ring until it has `count` places; a snapshot keeps the old one, which changes no more."""
+    def _grow(self, count: int) -> None:
+        """Doubles the capacity until it is at least `count`; a snapshot keeps the old memory, which stays unchanged."""
         if count <= len(self._ring):
             return
         old, start, held = as_bytes(self._ring), self._first % len(self._ring), self._next - self._first
@@ -76,26 +76,33 @@ class FrameRing:
             self._write(self._next - rest, old[:rest])
 
     def snapshot(self) -> RingSnapshot:
-        """All places as they are now; one taken before may not be written any more."""
+        """Takes a snapshot of all slots, in the order of `slots`; earlier snapshots become invalid."""
         self._snapshot = RingSnapshot(self._ring, len(self._ring))
         return self._snapshot
 
     def get_state(self) -> list[int]:
-        """The range of the frames' numbers, for JSON; the frames are in `snapshot`."""
+        """First frame number held and the next one to be given, for JSON; `snapshot` holds the frames."""
         return [self._first, self._next]
 
     def load(self, path: Path, state: list[int], at_most: int) -> None:
-        """Takes up the places of a `snapshot` that were saved at `path`, and the `get_state` of the same moment.
+        """Restores the ring.
+
+        Args:
+          path: zarr group of a saved `snapshot`.
+          state: the `get_state` of the same moment.
+          at_most: most frames that the shard can need.
 
         Raises:
-          ValueError: they are damaged, do not fit each other, or are more than `at_most` frames ask for.
+          ValueError: the frames are damaged, do not match the state, or are more than `at_most` frames need.
         """
         if not (isinstance(state, list) and len(state) == 2 and all(type(number) is int for number in state)):
             raise ValueError(f"the numbers of the frames at {path} are {state!r}, not two whole numbers")
-        (first, after), most = state, max(SMALLEST, 1 << (at_most - 1).bit_length())
+        (first, after), most = state, max(MIN_CAPACITY, 1 << (at_most - 1).bit_length())
         ring = load_rows(path, self._dtype, at_most=most)
-        places = len(ring)
-        if places < SMALLEST or places & (places - 1) or not 0 <= first <= after <= min(first + places, LAST):
-            raise ValueError(f"{path} has {places} places, which is no ring of frames {first} to {after}")
+        capacity = len(ring)
+        is_power_of_2 = capacity & (capacity - 1) == 0
+        is_in_range = 0 <= first <= after <= min(first + capacity, MAX_NUMBER)
+        if capacity < MIN_CAPACITY or not is_power_of_2 or not is_in_range:
+            raise ValueError(f"{path} has {capacity} slots, which is no ring of frames {first} to {after}")
         self._ring, self._first, self._next = ring, first, after
         self._snapshot = RingSnapshot(self._ring, 0)

@@ -15,8 +15,8 @@ from actors.policy.network import WeightsSnapshot
 from actors.replay.prioritised import PrioritisedShard, PrioritySettings
 from actors.replay.shard import ReplayShard
 from actors.service.messages import AddReply, Delivered, SampleReply, TransitionBlock
-from actors.storage.malloc import keep_large_apart
-from actors.storage.part_writer import PartWriter, Written
+from actors.storage.fragment_writer import FragmentWriter, WriteResult
+from actors.storage.malloc import limit_fragmentation
 from actors.storage.uri import Location, fetched
 
 REMEMBERED_BLOCKS = 8
@@ -44,9 +44,9 @@ class ShardNode:
     """A replay shard that tells every worker of newer weights."""
 
     def __init__(self, settings: ShardSettings) -> None:
-        keep_large_apart()  # blocks come and go here
+        limit_fragmentation()  # blocks come and go here
         self.shard = make_shard(settings)
-        self._writer = PartWriter()
+        self._writer = FragmentWriter()
         self._weights: WeightsSnapshot | None = None
         self._known: dict[int, deque[tuple[int, int]]] = {}
         self._delivered: dict[int, tuple[int, Delivered]] = {}
@@ -117,7 +117,7 @@ class ShardNode:
             snapshot.close()
         return self.shard.get_state()
 
-    def saved(self, timeout_s: float = 0.0) -> Written | None:
+    def saved(self, timeout_s: float = 0.0) -> WriteResult | None:
         """How the last `save` ended; None while it is still being written after `timeout_s`."""
         return self._writer.result(timeout_s)
 

@@ -1,1 +1,1 @@
-"""Stepping environments, exploring, and building n-step transitions."""
+"""Rollout workers: vector environments, exploration, n-step transitions."""

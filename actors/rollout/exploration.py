@@ -1,6 +1,6 @@
-"""How much a rollout worker explores: one schedule for all, or a ladder over workers.
+"""Epsilon-greedy exploration: one schedule for all rollout workers, or Ape-X's ladder of constant rates.
 
-Every rate is a function of counters that a checkpoint holds, so that a resumed run goes on where it was.
+Every rate is a function of counters that a checkpoint holds, so that a resumed run continues with the same rates.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 GREEDY = -1
-"""In the place of an action: the policy's own."""
+"""Stands for the policy's greedy action among random actions."""
 
 
 class Exploration(NamedTuple):
-    """Settings of epsilon-greedy exploration (see RunConfig for their meaning)."""
+    """Settings of epsilon-greedy exploration (see RunConfig)."""
 
     kind: Literal["schedule", "ladder"]
     start: float
@@ -26,9 +26,10 @@ class Exploration(NamedTuple):
 
 
 def epsilon(exploration: Exploration, env_steps: int, worker_id: int, workers: int) -> float:
-    """The worker's exploration rate after `env_steps` env steps of the whole run.
+    """Exploration rate of worker `worker_id` of `workers` after `env_steps` env steps of the whole run.
 
-    The ladder is Ape-X's (Horgan et al. 2018, Section 4.1): epsilon_i = base^(1 + i / (N - 1) * exponent).
+    The schedule is linear and then constant. The ladder is that of Ape-X (Horgan et al. 2018, Section 4.1):
+    epsilon_i = base^(1 + i / (N - 1) * exponent).
     """
     if exploration.kind == "ladder":
         rung = worker_id / (workers - 1) if workers > 1 else 0.0
@@ -37,16 +38,24 @@ def epsilon(exploration: Exploration, env_steps: int, worker_id: int, workers: i
     return exploration.start + done * (exploration.end - exploration.start)
 
 
-def draw_detours(shape: tuple[int, ...], rate: float, num_actions: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """What epsilon-greedy does of its own accord, for many steps at once.
+def draw_random_actions(
+    shape: tuple[int, ...], rate: float, num_actions: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Draws the random actions of many steps in advance.
+
+    Args:
+      shape: shape of the result.
+      rate: exploration rate, the probability of a random action.
+      num_actions: number of actions.
+      rng: random stream.
 
     Returns:
-      A uniform action with probability `rate`, else GREEDY; of `shape`.
+      `shape` int64: a uniformly drawn action with probability `rate`, GREEDY elsewhere.
     """
     random = rng.integers(num_actions, size=shape)
     return np.where(rng.random(shape) < rate, random, GREEDY)
 
 
-def explore(greedy: NDArray[np.int64], detours: NDArray[np.int64]) -> NDArray[np.int64]:
-    """`greedy` `[batch]`, with the actions of `detours` `[batch]` in the place of some."""
-    return np.where(detours == GREEDY, greedy, detours)
+def explore(greedy: NDArray[np.int64], random_actions: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Actions `[batch]`: those of `random_actions` `[batch]`, and those of `greedy` `[batch]` where they are GREEDY."""
+    return np.where(random_actions == GREEDY, greedy, random_actions)

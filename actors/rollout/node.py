@@ -15,7 +15,7 @@ from safetensors.numpy import load_file, save_file
 
 from actors.policy.network import WeightsSnapshot
 from actors.rollout.worker import RolloutSettings, RolloutWorker
-from actors.service.fault_policy import Action, CallFailed, Fault, PartKind, decide
+from actors.service.fault_policy import Action, CallFailed, ComponentKind, Fault, decide
 from actors.service.messages import (
     ACTS,
     STORES,
@@ -27,7 +27,7 @@ from actors.service.messages import (
 )
 from actors.service.rpc import Calls, Node, Ref
 from actors.service.stopwatch import Stopwatch
-from actors.storage.part_writer import PartWriter, Written
+from actors.storage.fragment_writer import FragmentWriter, WriteResult
 from actors.storage.uri import Location, fetched
 
 
@@ -85,7 +85,7 @@ class RolloutNode:
         self._shard_incarnations = [0] * len(shards)
         self._next_shard = worker_id % len(shards)
         self._limit = pushes_in_flight
-        self._writer = PartWriter()
+        self._writer = FragmentWriter()
         self._pushes: deque[_Push] = deque()
         self._watch = Stopwatch()
 
@@ -143,7 +143,7 @@ class RolloutNode:
             try:
                 reply: AddReply = self._calls.get(push.ref)
             except CallFailed as failure:
-                if decide(PartKind.SHARD, failure.fault, push.attempt, 0.0) is not Action.RETRY:
+                if decide(ComponentKind.SHARD, failure.fault, push.attempt, 0.0) is not Action.RETRY:
                     return _report(push, AddReply(0, False, -1, None), Dropped.SHARD_LOST)._replace(fault=failure.fault)
                 push = self._push(push.block, push.shard, push.attempt + 1)
                 continue
@@ -173,7 +173,7 @@ class RolloutNode:
         self._writer.start(location, lambda path: save_file(state["arrays"], str(path)))
         return {**state["meta"], "next_shard": self._next_shard}
 
-    def saved(self, timeout_s: float = 0.0) -> Written | None:
+    def saved(self, timeout_s: float = 0.0) -> WriteResult | None:
         """How the last `save` ended; None while it is still being written after `timeout_s`."""
         return self._writer.result(timeout_s)
 

@@ -1,4 +1,4 @@
-"""n-step transitions of many environments, a block at a time (Sutton and Barto, 2nd edition, Section 7.1)."""
+"""n-step transitions of many environments, assembled block by block (Sutton and Barto, 2nd edition, Section 7.1)."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from sim_core.jit import inlined, kernel
 class Steps(NamedTuple):
     """Consecutive env steps of many environments, each array `[steps, num_envs, ...]`.
 
-    observation, action: what was seen and done.
+    observation, action: the observation and the action taken in it.
     reward: float64.
-    reached: the state that the step led to, an ended episode's last where `done`.
-    terminated: where the task ended.
-    done: where the episode ended, by the task or by the clock.
+    next_observation: observation after the step; an episode's last one where `done`.
+    terminated: where the task terminated.
+    done: where the episode ended, terminated or truncated.
     """
 
     observation: NDArray[Any]
     action: NDArray[np.int64]
     reward: NDArray[np.float64]
-    reached: NDArray[Any]
+    next_observation: NDArray[Any]
     terminated: NDArray[np.bool_]
     done: NDArray[np.bool_]
 
@@ -36,28 +36,28 @@ def _pairs(a: Steps, b: Steps) -> Iterable[tuple[NDArray[Any], NDArray[Any]]]:
 
 
 def empty_steps(steps: int, num_envs: int, dtype: np.dtype[Any]) -> Steps:
-    """Zeroed Steps for rows of `dtype`, packed ones or whole ones."""
+    """Zeroed Steps; `dtype` is that of a transition or of a packed row, and gives the observations' shape and dtype."""
     observation = dtype["observation"]
-    seen = (steps, num_envs, *observation.shape)
+    shape = (steps, num_envs, *observation.shape)
     return Steps(
-        observation=np.zeros(seen, observation.base),
+        observation=np.zeros(shape, observation.base),
         action=np.zeros((steps, num_envs), np.int64),
         reward=np.zeros((steps, num_envs)),
-        reached=np.zeros(seen, observation.base),
+        next_observation=np.zeros(shape, observation.base),
         terminated=np.zeros((steps, num_envs), np.bool_),
         done=np.zeros((steps, num_envs), np.bool_),
     )
 
 
 class NStepAssembler:
-    """Turns env steps into transitions over `n_step` steps, cut short where an episode ends.
+    """Turns env steps into n-step transitions, which are shorter where an episode ends.
 
-    The last `n_step - 1` steps are kept: those that have not seen `n_step` rewards wait for the next block.
+    The last `n_step - 1` steps are kept. Those without `n_step` rewards are pending: the next block completes them.
 
     Args:
-      dtype: the packed row (`actors.service.packing.packed_dtype`).
+      dtype: structured dtype of a packed row (`actors.service.packing.packed_dtype`).
       num_envs: number of environments.
-      n_step: steps a transition spans.
+      n_step: steps per transition.
       discount: gamma.
     """
 
@@ -65,68 +65,68 @@ class NStepAssembler:
         self._dtype = dtype
         self._powers = discount ** np.arange(n_step + 1)
         self._kept = empty_steps(n_step - 1, num_envs, dtype)
-        self._waits = np.zeros((n_step - 1, num_envs), np.bool_)
+        self._pending = np.zeros((n_step - 1, num_envs), np.bool_)
 
     def push(self, steps: Steps) -> Packed:
         """Takes the next env steps and returns the transitions that they complete, oldest first.
 
-        Kept steps that wait are of running episodes, so that every one of them ends in a new step.
+        Pending steps belong to running episodes, so that each of their transitions ends in a new step.
         """
-        window = self._after_the_kept(steps)
-        packed, self._waits = self._complete(window)
-        for mine, array in _pairs(self._kept, window):
-            mine[...] = array[len(array) - len(mine) :]
-        self._kept.done[:] = False  # what waits belongs to running episodes; the rest is of no use any more
+        window = self._with_kept(steps)
+        packed, self._pending = self._complete(window)
+        for kept, array in _pairs(self._kept, window):
+            kept[...] = array[len(array) - len(kept) :]
+        self._kept.done[:] = False  # pending steps belong to running episodes; the others are not used again
         return packed
 
     def _complete(self, window: Steps) -> tuple[Packed, NDArray[np.bool_]]:
-        """The transitions that are complete; and which of the last steps wait."""
+        """Returns the complete transitions, and which of the last `n_step - 1` steps are pending."""
         shape = window.done.shape
         rows = np.zeros(window.done.size, self._dtype)
-        frames = np.empty((len(rows), *window.reached.shape[2:]), window.reached.dtype)
+        frames = np.empty((len(rows), *window.next_observation.shape[2:]), window.next_observation.dtype)
         columns = _Columns(
-            _steps_as_bytes(window.observation), _steps_as_bytes(window.reached), *window[1:3], *window[4:]
+            _steps_as_bytes(window.observation), _steps_as_bytes(window.next_observation), *window[1:3], *window[4:]
         )
-        begun = _Begun(np.full(shape, -1), np.empty(len(rows), np.int64))
-        waits, fields = np.zeros_like(self._waits), fields_of(rows)
-        count = _assemble(columns, self._waits, self._powers, fields, waits, begun)
-        kept = _link(columns, fields, as_bytes(frames), begun)
-        return Packed(rows[:count], frames[:kept].copy()), waits
+        index = _RowIndex(np.full(shape, -1), np.empty(len(rows), np.int64))
+        pending, fields = np.zeros_like(self._pending), fields_of(rows)
+        num_rows = _assemble(columns, self._pending, self._powers, fields, pending, index)
+        num_frames = _link(columns, fields, as_bytes(frames), index)
+        return Packed(rows[:num_rows], frames[:num_frames].copy()), pending
 
-    def _after_the_kept(self, steps: Steps) -> Steps:
-        if not len(self._waits):
+    def _with_kept(self, steps: Steps) -> Steps:
+        if not len(self._pending):
             return steps
         return Steps(*(np.concatenate(pair) for pair in _pairs(self._kept, steps)))
 
-    def clear(self) -> None:
-        """Forgets all waiting steps."""
-        self._waits[:] = False
-
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Copies of all that a checkpoint needs."""
+        """Copies of everything that a checkpoint needs."""
         names = ("observation", "action", "reward")
-        return {f"kept_{name}": getattr(self._kept, name).copy() for name in names} | {"waits": self._waits.copy()}
+        return {f"kept_{name}": getattr(self._kept, name).copy() for name in names} | {"waits": self._pending.copy()}
 
     def set_state(self, saved: dict[str, NDArray[Any]]) -> None:
-        """Takes up what `get_state` gave."""
+        """Restores a `get_state`."""
         for name in ("observation", "action", "reward"):
             getattr(self._kept, name)[...] = saved[f"kept_{name}"]
-        self._waits = saved["waits"].copy()
+        self._pending = saved["waits"].copy()
 
 
 class _Columns(NamedTuple):
-    """Env steps as Steps, observations as bytes `[steps, num_envs, bytes]`, which are the same type of all methods."""
+    """Steps with observations as bytes `[steps, num_envs, bytes]`, so that kernels compile once for all methods."""
 
     observation: NDArray[np.uint8]
-    reached: NDArray[np.uint8]
+    next_observation: NDArray[np.uint8]
     action: NDArray[np.int64]
     reward: NDArray[np.float64]
     terminated: NDArray[np.bool_]
     done: NDArray[np.bool_]
 
 
-class _Begun(NamedTuple):
-    """Of every env step `[steps, num_envs]` the row that begins with it, -1 for none; of every row its last step."""
+class _RowIndex(NamedTuple):
+    """Which row starts at which step.
+
+    `row` `[steps, num_envs]`: the row that starts at an env step, -1 if there is none. `last` `[rows]`: the last step
+    that a row counts.
+    """
 
     row: NDArray[np.int64]
     last: NDArray[np.int64]
@@ -139,62 +139,68 @@ def _steps_as_bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
 @kernel
 def _assemble(
     steps: _Columns,
-    waited: NDArray[np.bool_],
+    was_pending: NDArray[np.bool_],
     powers: NDArray[np.float64],
     rows: Fields,
-    waits: NDArray[np.bool_],
-    begun: _Begun,
+    pending: NDArray[np.bool_],
+    index: _RowIndex,
 ) -> int:
-    """Writes the transitions that are complete to `rows`, and to `waits` which of the last steps are not.
+    """Writes the complete transitions to `rows` and `index`; returns their number.
 
-    Of the first steps only those that `waited` begin a transition. `powers` are gamma's up to the n-th.
+    Args:
+      steps: the kept steps and the new ones.
+      was_pending: which of the kept steps start a transition `[n_step - 1, num_envs]`.
+      powers: gamma^0 to gamma^n.
+      rows: written; all fields but `next_row`.
+      pending: written; which of the last steps are not complete yet `[n_step - 1, num_envs]`.
+      index: written.
     """
     total, num_envs = steps.done.shape
-    kept, count = len(waits), 0
+    kept, count = len(pending), 0
     for step in range(total):
         for env in range(num_envs):
-            if step < kept and not waited[step, env]:
+            if step < kept and not was_pending[step, env]:
                 continue
-            value, last, ended = _look_ahead(steps, powers, step, env)
+            value, last, ended = _n_step_return(steps, powers, step, env)
             if not ended and step >= total - kept:
-                waits[step - (total - kept), env] = True
+                pending[step - (total - kept), env] = True
                 continue
             rows.reward[count] = value
             rows.discount[count] = 0.0 if steps.terminated[last, env] and ended else powers[last + 1 - step]
             rows.action[count] = steps.action[step, env]
-            copy_bytes(steps.observation[step, env], rows.memory[count], rows.place)
-            begun.row[step, env] = count
-            begun.last[count] = last
+            copy_bytes(steps.observation[step, env], rows.row_bytes[count], rows.offset)
+            index.row[step, env] = count
+            index.last[count] = last
             count += 1
     return count
 
 
 @kernel
-def _link(steps: _Columns, rows: Fields, frames: NDArray[np.uint8], begun: _Begun) -> int:
-    """Writes `next_row`, and to `frames` those that it takes; returns how many these are."""
+def _link(steps: _Columns, rows: Fields, frames: NDArray[np.uint8], index: _RowIndex) -> int:
+    """Writes `next_row` of all rows, and the frames that they refer to; returns the number of frames."""
     total, num_envs = steps.done.shape
     count = 0
     for step in range(total):
         for env in range(num_envs):
-            row = begun.row[step, env]
+            row = index.row[step, env]
             if row < 0:
                 continue
-            last = begun.last[row]
+            last = index.last[row]
             after = -1
             if last + 1 < total and not steps.done[last, env]:
-                after = begun.row[last + 1, env]
+                after = index.row[last + 1, env]
             if after >= 0:
                 rows.next_row[row] = after - row
             else:
                 rows.next_row[row] = -count
-                copy_bytes(steps.reached[last, env], frames[count], 0)
+                copy_bytes(steps.next_observation[last, env], frames[count], 0)
                 count += 1
     return count
 
 
 @inlined
-def _look_ahead(steps: _Columns, powers: NDArray[np.float64], step: int, env: int) -> tuple[float, int, bool]:
-    """The discounted rewards from a step on, the last step that they count, and whether the episode ended there."""
+def _n_step_return(steps: _Columns, powers: NDArray[np.float64], step: int, env: int) -> tuple[float, int, bool]:
+    """(n-step return from `step` on, the last step that it counts, whether the episode ended there)."""
     value, last = 0.0, step
     for ahead in range(min(len(powers) - 1, steps.done.shape[0] - step)):
         last = step + ahead

@@ -1,4 +1,4 @@
-"""The environments of rollout workers and evaluators: any Gymnasium id, as a `VectorEnv`."""
+"""Vector environments for rollout workers and evaluators, from any Gymnasium id."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from sim_core.worlds import rehearse
 
 
 class EnvSpec(NamedTuple):
-    """Which environment: a Gymnasium id, and the world if it is ours."""
+    """Specification of an environment: its Gymnasium id, and the world's settings if it is the swarm environment."""
 
     env_id: str
     world: WorldConfig
 
     @property
     def is_swarm(self) -> bool:
-        """Whether this is our own environment."""
+        """Whether this is the project's own swarm environment."""
         return self.env_id == ENV_ID
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Keyword arguments of Gymnasium's `make` and `make_vec`."""
+        """Keyword arguments for Gymnasium's `make` and `make_vec`."""
         return dataclasses.asdict(self.world) if self.is_swarm else {}
 
 
 def make_vector_env(spec: EnvSpec, num_envs: int) -> gym.vector.VectorEnv[Any, Any, Any]:
-    """`num_envs` environments that restart in the same step (`AutoresetMode.SAME_STEP`).
+    """Makes `num_envs` environments that restart in the step that ends an episode (`AutoresetMode.SAME_STEP`).
 
     Raises:
-      ConfigError: the id is unknown, or its spaces are not a Box and a Discrete from 0.
+      ConfigError: the id is unknown, its observations are no Box, or its actions are no Discrete that starts at 0.
     """
     try:
         if spec.is_swarm:
@@ -52,13 +52,13 @@ def make_vector_env(spec: EnvSpec, num_envs: int) -> gym.vector.VectorEnv[Any, A
 
 
 def reset_seeded(env: gym.vector.VectorEnv[Any, Any, Any], seeds: list[int]) -> NDArray[Any]:
-    """First observations `[num_envs, ...]` of new episodes, environment i from `seeds[i]`."""
+    """Resets environment i with `seeds[i]`; returns the first observations `[num_envs, ...]`."""
     observation: NDArray[Any] = env.reset(seed=seeds)[0]  # type: ignore[arg-type]  # every VectorEnv takes a list
     return observation
 
 
 def spaces_of(env: gym.vector.VectorEnv[Any, Any, Any]) -> EnvShape:
-    """The spaces of environments that `make_vector_env` made."""
+    """Spaces of environments that `make_vector_env` made."""
     space, actions = env.single_observation_space, env.single_action_space
     assert isinstance(space, gym.spaces.Box) and isinstance(actions, gym.spaces.Discrete)
     return EnvShape(space, int(actions.n))
@@ -73,7 +73,7 @@ def _check_spaces(env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> None
 
 
 class EnvShape(NamedTuple):
-    """Spaces of an environment, as the network and the replay need them."""
+    """Spaces of one environment, as the network and the replay need them."""
 
     observation_space: gym.spaces.Box
     num_actions: int
@@ -85,10 +85,10 @@ class EnvShape(NamedTuple):
 
 
 def env_shape(spec: EnvSpec) -> EnvShape:
-    """The spaces of `spec`, found by making one environment; a user's own method or scene is rehearsed first.
+    """Spaces of `spec`, read from one environment that is made for this; a user's method or scene is rehearsed first.
 
     Raises:
-      ConfigError: see `make_vector_env`, or the rehearsal shows an error in the user's code.
+      ConfigError: see `make_vector_env`; also if the rehearsal finds an error in the user's code.
     """
     if spec.is_swarm:
         rehearse(spec.world)
@@ -100,10 +100,20 @@ def env_shape(spec: EnvSpec) -> EnvShape:
 
 
 def final_observations(observation: NDArray[Any], done: NDArray[np.bool_], infos: dict[str, Any]) -> NDArray[Any]:
-    """The states that a step reached: `observation`, with the ended episodes' last ones put in."""
+    """Next observations of a step, without the effect of restarts.
+
+    Args:
+      observation: what the step returned `[num_envs, ...]`; the first observation of a new episode where `done`.
+      done: where an episode ended `[num_envs]`.
+      infos: what the step returned; `final_obs` holds the last observations of ended episodes.
+
+    Returns:
+      `observation` itself if no episode ended, else a copy with the last observations of ended episodes.
+    """
     if not done.any():
         return observation
-    reached = observation.copy()
+    next_observation = observation.copy()
     final = infos["final_obs"][done]
-    reached[done] = final if final.dtype == observation.dtype else np.stack(list(final))  # Gymnasium's are objects
-    return reached
+    is_array = final.dtype == observation.dtype  # Gymnasium's own vector environments give an array of objects
+    next_observation[done] = final if is_array else np.stack(list(final))
+    return next_observation

@@ -1,4 +1,4 @@
-"""The rollout worker: steps many environments with one policy and packs what it sees into blocks."""
+"""The rollout worker: steps many environments with one policy and packs the transitions into blocks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.policy.network import Policy, WeightsSnapshot
-from actors.rollout.exploration import draw_detours, explore
+from actors.rollout.exploration import draw_random_actions, explore
 from actors.rollout.nstep import NStepAssembler, Steps, empty_steps
 from actors.rollout.vector_env import EnvSpec, final_observations, make_vector_env, reset_seeded, spaces_of
 from actors.service.messages import (
@@ -24,7 +24,7 @@ from sim_core.envs import SwarmVectorEnv
 
 
 class RolloutSettings(NamedTuple):
-    """What a rollout worker needs to know of the run."""
+    """Settings of the run that a rollout worker needs."""
 
     env: EnvSpec
     num_envs: int
@@ -35,12 +35,12 @@ class RolloutSettings(NamedTuple):
 
 
 class RolloutWorker:
-    """Steps `num_envs` environments; one `collect` is one block of `num_envs * steps_per_block` env steps.
+    """Steps `num_envs` environments; one `collect` makes one block of `num_envs * steps_per_block` env steps.
 
     Args:
       settings: see RolloutSettings.
-      worker_id: position among the workers.
-      incarnation: how often this worker was started before; every start has its own random streams.
+      worker_id: index among the workers.
+      incarnation: distinguishes the starts of this worker; each one has its own random streams.
     """
 
     def __init__(self, settings: RolloutSettings, worker_id: int, incarnation: int) -> None:
@@ -65,28 +65,28 @@ class RolloutWorker:
 
     @property
     def policy_version(self) -> int:
-        """Version of the weights in use; -1 before there are any."""
+        """Version of the weights in use; -1 before the first ones."""
         return -1 if self._policy is None else self._policy.weights.version
 
     def set_weights(self, weights: WeightsSnapshot) -> None:
         """Acts with these weights from the next env step on."""
         self._policy = Policy(weights)
 
-    def collect(self, rate: float) -> TransitionBlock:
-        """Steps every environment `steps_per_block` times with exploration rate `rate`.
+    def collect(self, epsilon: float) -> TransitionBlock:
+        """Steps every environment `steps_per_block` times with exploration rate `epsilon`.
 
         Raises:
-          RuntimeError: no weights were set.
+          RuntimeError: no weights have been set.
         """
         if self._policy is None:
             raise RuntimeError("a rollout worker needs weights before it collects")
         count = self._settings.steps_per_block
         steps = empty_steps(count, self._settings.num_envs, self._dtype)
-        detours = draw_detours((count, self._settings.num_envs), rate, self._num_actions, self._rng)
-        shape = steps.done.shape
+        shape = (count, self._settings.num_envs)
+        random_actions = draw_random_actions(shape, epsilon, self._num_actions, self._rng)
         ended = EpisodeStats(np.zeros(shape, np.int8), np.zeros(shape, np.int32), np.zeros(shape))
         for i in range(count):
-            self._step(self._policy, detours[i], steps, ended, i)
+            self._step(self._policy, random_actions[i], steps, ended, i)
         packed = self._nstep.push(steps)
         self._made += len(packed.rows)
         weights = self._policy.weights
@@ -97,20 +97,22 @@ class RolloutWorker:
             sequence=self._sequence,
             policy_version=weights.version,
             policy_time_s=weights.time_s,
-            epsilon=rate,
+            epsilon=epsilon,
             env_steps=count * self._settings.num_envs,
             made=self._made,
         )
         self._sequence += 1
-        return TransitionBlock(header, packed, _of_those(steps.done, ended))
+        return TransitionBlock(header, packed, _select(ended, steps.done))
 
-    def _step(self, policy: Policy, detours: NDArray[np.int64], steps: Steps, ended: EpisodeStats, i: int) -> None:
-        """One step of every environment, written as step i of `steps`; what it ended, as step i of `ended`."""
-        action = explore(policy.greedy(self._observation), detours)
+    def _step(
+        self, policy: Policy, random_actions: NDArray[np.int64], steps: Steps, ended: EpisodeStats, i: int
+    ) -> None:
+        """Steps every environment once; writes row i of `steps`, and of `ended` where an episode ends."""
+        action = explore(policy.greedy(self._observation), random_actions)
         observation, reward, terminated, truncated, infos = self._env.step(action)
         done = terminated | truncated
         steps.observation[i], steps.action[i], steps.reward[i] = self._observation, action, reward
-        steps.reached[i] = final_observations(observation, done, infos)
+        steps.next_observation[i] = final_observations(observation, done, infos)
         steps.terminated[i], steps.done[i] = terminated, done
         self._observation = observation
         self._length += 1
@@ -122,9 +124,9 @@ class RolloutWorker:
             self._return[done] = 0.0
 
     def get_state(self) -> dict[str, Any]:
-        """All that a checkpoint needs: `arrays` by name and `meta` for JSON.
+        """Everything that a checkpoint needs: `arrays` by name, and `meta` for JSON.
 
-        Only our own environments can save their worlds; others start new episodes on resume.
+        Only the swarm environment can save its worlds; others start new episodes after a resume.
         """
         arrays = {f"nstep_{name}": array for name, array in self._nstep.get_state().items()}
         arrays |= {"length": self._length.copy(), "return": self._return.copy()}
@@ -138,7 +140,7 @@ class RolloutWorker:
         return {"arrays": arrays, "meta": meta}
 
     def set_state(self, arrays: dict[str, NDArray[Any]], meta: dict[str, Any]) -> None:
-        """Takes up what `get_state` gave, under the incarnation of this start."""
+        """Restores a `get_state`; the incarnation stays that of this start."""
         self._sequence = meta["sequence"]
         self._rng.bit_generator.state = meta["rng"]
         if meta["policy"] is not None:
@@ -154,14 +156,14 @@ class RolloutWorker:
         self._length[:], self._return[:] = arrays["length"], arrays["return"]
 
 
-def join_stats(parts: list[EpisodeStats]) -> EpisodeStats:
-    """One EpisodeStats of several, in order."""
-    if not parts:
+def join_stats(stats: list[EpisodeStats]) -> EpisodeStats:
+    """Concatenates EpisodeStats in order."""
+    if not stats:
         return EpisodeStats(np.zeros(0, np.int8), np.zeros(0, np.int32), np.zeros(0, np.float64))
-    columns = zip(*parts, strict=True)
+    columns = zip(*stats, strict=True)
     return EpisodeStats(*(np.concatenate(column) for column in columns))
 
 
-def _of_those(which: NDArray[np.bool_], stats: EpisodeStats) -> EpisodeStats:
+def _select(stats: EpisodeStats, mask: NDArray[np.bool_]) -> EpisodeStats:
     outcome, length_steps, episode_return = stats
-    return EpisodeStats(outcome[which], length_steps[which], episode_return[which])
+    return EpisodeStats(outcome[mask], length_steps[mask], episode_return[mask])

@@ -1,1 +1,1 @@
-"""Calls between components, the messages they carry, and what is done when a call fails."""
+"""Calls between components, the messages that they carry, and the reactions to failed calls."""

@@ -1,8 +1,8 @@
-"""What may fail while a run goes on, and what is done about it: a pure decision table and its memory.
+"""How a run reacts to failures: a pure decision table, and a tracker of each component's consecutive failures.
 
-Nothing here knows Ray: failures come in as values, decisions go out as values (the idea is that of
-dask.distributed's `worker_state_machine.py`). Calls that may be made twice without harm are tried again; for
-all others the part is replaced by a new incarnation, for nobody can say how far the old one came.
+The module knows nothing of Ray: failures come in as values, decisions go out as values (the design follows
+dask.distributed's `worker_state_machine.py`). A call is retried if running it twice does no harm. Otherwise the
+component is replaced by a new incarnation, since nobody can tell how far the old one got.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from enum import StrEnum
 from typing import NamedTuple
 
 MAX_ATTEMPTS = 5
-"""Failures in a row, with nothing done in between, after which a part is given up."""
+"""Consecutive failures, with no successful call in between, after which the run gives up on a component."""
 MAX_RETRIES = 2
-"""Failures in a row after which a part that is hard to reach is replaced."""
+"""Consecutive failures after which an unreachable component is replaced instead of retried."""
 GIVE_UP_S = 3_600.0
-"""Time without a single call done after which a part is given up."""
+"""Seconds without a successful call after which the run gives up on a component."""
 
 
-class PartKind(StrEnum):
-    """What a run consists of."""
+class ComponentKind(StrEnum):
+    """The kinds of component in a run."""
 
     WORKER = "rollout worker"
     SHARD = "replay shard"
@@ -28,47 +28,48 @@ class PartKind(StrEnum):
 
 
 class Fault(StrEnum):
-    """How a call can fail through no fault of the code that it runs."""
+    """How a call can fail although the code that it runs is correct."""
 
     DIED = "died"
-    """The process is gone, with its node or alone."""
+    """The process is gone, alone or with its machine."""
     LATE = "late"
-    """No answer within the deadline: it hangs, is stopped, or was never placed."""
+    """No answer within the deadline: the process hangs, is stopped, or was never scheduled."""
     UNREACHABLE = "unreachable"
-    """The connection broke; the process may live and may have done the call."""
+    """The connection broke. The process may be alive and may have executed the call."""
     OBJECT_LOST = "object lost"
-    """A value that the call needed or gave is gone with the process that held it."""
+    """An argument or result of the call was lost with the process that held it."""
 
 
 class Action(StrEnum):
-    """What is done about a failure."""
+    """The reaction to a failure."""
 
     RETRY = "retry"
-    """The same call again."""
+    """Make the same call again."""
     RESTART = "restart"
-    """A new incarnation of the part: a worker with the current weights and fresh streams, a shard empty."""
+    """Start a new incarnation: a worker with the current weights and fresh random streams, a shard empty."""
     REBUILD = "rebuild"
-    """All parts anew, from the last checkpoint."""
+    """Start every component again, from the last checkpoint."""
     STOP = "stop"
-    """The run ends; `shoal resume` goes on once the cause is mended."""
+    """End the run; `shoal resume` continues it once the cause is fixed."""
 
 
-class Part(NamedTuple):
-    """One part of a run."""
+class Component(NamedTuple):
+    """One component of a run; `number` counts the workers, or the shards, from 0."""
 
-    kind: PartKind
+    kind: ComponentKind
     number: int = 0
 
     def __str__(self) -> str:
-        """What people call it."""
-        return f"{self.kind} {self.number}" if self.kind in (PartKind.WORKER, PartKind.SHARD) else str(self.kind)
+        """Name for people, such as `rollout worker 3`."""
+        is_one_of_several = self.kind in (ComponentKind.WORKER, ComponentKind.SHARD)
+        return f"{self.kind} {self.number}" if is_one_of_several else str(self.kind)
 
 
 class CallFailed(Exception):
-    """A call failed though its code is sound.
+    """A call failed although the code that it runs is correct.
 
     Args:
-      fault: how.
+      fault: how it failed.
       reason: one line for people.
     """
 
@@ -79,77 +80,82 @@ class CallFailed(Exception):
 
 
 def first_line(error: BaseException) -> str:
-    """What an error says, in one line; its kind where it says nothing."""
+    """First line of an error's message; the name of its type if the message is empty."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-class PartFailed(Exception):
-    """A part of the run failed.
+class ComponentFailed(Exception):
+    """A component of the run failed.
 
     Args:
-      part: which.
-      incarnation: of which of its starts the failure tells.
-      fault: how.
+      component: the component.
+      incarnation: the incarnation that failed.
+      fault: how it failed.
       reason: one line for people.
     """
 
-    def __init__(self, part: Part, incarnation: int, fault: Fault, reason: str) -> None:
-        super().__init__(part, incarnation, fault, reason)
-        self.part = part
+    def __init__(self, component: Component, incarnation: int, fault: Fault, reason: str) -> None:
+        super().__init__(component, incarnation, fault, reason)
+        self.component = component
         self.incarnation = incarnation
         self.fault = fault
         self.reason = reason
 
     def __str__(self) -> str:
-        """A sentence for people."""
-        return f"{self.part} {self.fault} ({self.reason})"
+        """One sentence for people."""
+        return f"{self.component} {self.fault} ({self.reason})"
 
 
 class RunFailed(RuntimeError):
-    """A part fails again and again and the run cannot go on; the message says which and how."""
+    """A component keeps failing and the run cannot continue; the message names the component and the fault."""
 
 
-_REPLACE = {
-    PartKind.WORKER: Action.RESTART,
-    PartKind.SHARD: Action.RESTART,
-    PartKind.LEARNER: Action.REBUILD,
-    PartKind.EVALUATOR: Action.RETRY,
+_REPLACEMENT = {
+    ComponentKind.WORKER: Action.RESTART,
+    ComponentKind.SHARD: Action.RESTART,
+    ComponentKind.LEARNER: Action.REBUILD,
+    ComponentKind.EVALUATOR: Action.RETRY,
 }
-"""How a part is replaced. What the learner knows is in checkpoints alone; an evaluation holds nothing."""
+"""How each kind is replaced. The learner's state survives in checkpoints alone; an evaluation has no state."""
 
-_HARMLESS_TWICE = {
-    (PartKind.SHARD, Fault.UNREACHABLE),  # pushes carry incarnation and sequence number, draws change nothing
-    (PartKind.SHARD, Fault.OBJECT_LOST),
+_IDEMPOTENT = {
+    (ComponentKind.SHARD, Fault.UNREACHABLE),  # pushes carry incarnation and sequence number, draws change nothing
+    (ComponentKind.SHARD, Fault.OBJECT_LOST),
 }
+"""Failures after which the same call may be made again without harm."""
 
 
-def decide(kind: PartKind, fault: Fault, attempts: int, age_s: float) -> Action:
-    """What to do about a failure.
+def decide(kind: ComponentKind, fault: Fault, attempts: int, age_s: float) -> Action:
+    """Looks up the reaction to a failure.
 
     Args:
-      kind: the part that failed.
-      fault: how.
-      attempts: its failures in a row, this one included, since it last did anything.
+      kind: kind of the component that failed.
+      fault: how it failed.
+      attempts: its consecutive failures, this one included.
       age_s: seconds since the first of them.
     """
     if attempts > MAX_ATTEMPTS or age_s > GIVE_UP_S:
         return Action.STOP
-    if (kind, fault) in _HARMLESS_TWICE and attempts <= MAX_RETRIES:
+    if (kind, fault) in _IDEMPOTENT and attempts <= MAX_RETRIES:
         return Action.RETRY
-    return _REPLACE[kind]
+    return _REPLACEMENT[kind]
 
 
 class Decision(NamedTuple):
-    """A decision and the attempts that it rests on."""
+    """The reaction to a failure, and the number of consecutive failures that led to it."""
 
     action: Action
     attempts: int
 
 
-class Mended(NamedTuple):
-    """A part works again: its failures in a row, the last one and its action, and how long it was out."""
+class Recovered(NamedTuple):
+    """A component works again.
 
-    part: Part
+    `fault` and `action` are those of its last failure, `attempts` counts its consecutive failures, and `seconds` is the
+    time since the first of them.
+    """
+
+    component: Component
     fault: Fault
     action: Action
     attempts: int
@@ -163,23 +169,23 @@ class _Streak(NamedTuple):
     action: Action
 
 
-class Recovery:
-    """Remembers each part's failures in a row, and decides about the next one."""
+class FaultTracker:
+    """Counts each component's consecutive failures and decides how to react to the next one."""
 
     def __init__(self) -> None:
-        self._streaks: dict[Part, _Streak] = {}
+        self._streaks: dict[Component, _Streak] = {}
 
-    def failed(self, failure: PartFailed, now_s: float) -> Decision:
-        """Decides about a failure at `now_s`."""
-        before = self._streaks.get(failure.part)
+    def record_failure(self, failure: ComponentFailed, now_s: float) -> Decision:
+        """Counts a failure at time `now_s` and decides about it."""
+        before = self._streaks.get(failure.component)
         since_s, attempts = (before.since_s, before.attempts + 1) if before else (now_s, 1)
-        action = decide(failure.part.kind, failure.fault, attempts, now_s - since_s)
-        self._streaks[failure.part] = _Streak(since_s, attempts, failure.fault, action)
+        action = decide(failure.component.kind, failure.fault, attempts, now_s - since_s)
+        self._streaks[failure.component] = _Streak(since_s, attempts, failure.fault, action)
         return Decision(action, attempts)
 
-    def worked(self, part: Part, now_s: float) -> Mended | None:
-        """Notes that `part` has done a call; tells if it had failed before."""
-        streak = self._streaks.pop(part, None)
+    def record_success(self, component: Component, now_s: float) -> Recovered | None:
+        """Ends the component's streak of failures at time `now_s`; returns None if there was none."""
+        streak = self._streaks.pop(component, None)
         if streak is None:
             return None
-        return Mended(part, streak.fault, streak.action, streak.attempts, now_s - streak.since_s)
+        return Recovered(component, streak.fault, streak.action, streak.attempts, now_s - streak.since_s)

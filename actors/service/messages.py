@@ -1,4 +1,4 @@
-"""What travels from a rollout worker to a replay shard, and what comes back: one named tuple a hop."""
+"""Messages between rollout workers, replay shards, the learner and the training loop: one named tuple per hop."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ SCHEMA_VERSION = 3
 """Version of the block layout; a shard refuses any other."""
 
 NO_OUTCOME = -1
-"""Outcome of an episode of an environment that names none."""
+"""Outcome of an episode whose environment reports none."""
 
 
 class EpisodeStats(NamedTuple):
-    """Episodes that ended while a block was collected; one entry an episode."""
+    """Statistics of finished episodes `[episodes]`: outcome, length in env steps, and undiscounted return."""
 
     outcome: NDArray[np.int8]
     length_steps: NDArray[np.int32]
@@ -28,11 +28,12 @@ class EpisodeStats(NamedTuple):
 
 
 class BlockHeader(NamedTuple):
-    """Where a block comes from.
+    """Origin of a block.
 
-    `incarnation` counts the starts of worker `worker_id`, `sequence` its blocks. `policy_version` is the
-    number of updates behind the weights that acted, `policy_time_s` the wall time of their publication. `made`
-    counts the transitions of this incarnation, this block's included.
+    Fields: version of the block layout; worker, its incarnation, and the block's sequence number within the
+    incarnation; policy version (updates applied to the weights that acted), and wall time at which these weights were
+    published; exploration rate; env steps in the block; transitions that this incarnation has made, this block's
+    included.
     """
 
     schema_version: int
@@ -47,7 +48,7 @@ class BlockHeader(NamedTuple):
 
 
 class TransitionBlock(NamedTuple):
-    """Transitions of a worker (see `actors.service.packing.Packed`)."""
+    """What a rollout worker pushes: packed transitions, and the episodes that ended while they were collected."""
 
     header: BlockHeader
     packed: Packed
@@ -55,15 +56,16 @@ class TransitionBlock(NamedTuple):
 
     @property
     def transitions(self) -> int:
-        """How many there are."""
+        """Number of transitions."""
         return len(self.packed.rows)
 
 
 class AddReply(NamedTuple):
-    """A shard's answer to a push: what was stored, and newer weights if there are any.
+    """A shard's reply to a push.
 
-    `weights` is a WeightsSnapshot, None if the block came from the newest version. A `duplicate` is
-    refused; it is `outdated` if it was never stored, for its worker has been replaced or a later block overtook it.
+    Fields: transitions stored; whether the block was refused as a duplicate; version of the shard's weights; these
+    weights (a WeightsSnapshot), or None if they are no newer than the block's; whether a refused block was never stored
+    because its worker has been replaced or a later block arrived first.
     """
 
     stored: int
@@ -74,28 +76,29 @@ class AddReply(NamedTuple):
 
 
 class Dropped(StrEnum):
-    """Why a transition that was made is not stored."""
+    """Why a transition that a worker made is not stored."""
 
     DUPLICATE = "duplicate"
-    """It is stored already."""
+    """The shard has stored it already."""
     OUTDATED = "outdated"
-    """A later block overtook it."""
+    """A later block of its worker arrived first."""
     SHARD_LOST = "shard lost"
-    """The shard that it was sent to is gone."""
+    """The shard it was sent to is gone."""
     WORKER_LOST = "worker lost"
-    """Its worker went before it was pushed."""
+    """Its worker failed before it was pushed."""
 
 
 ACTS, STORES, WAITS = "acts", "stores", "waits"
-"""A rollout worker steps its environments, waits for a shard's reply to a push, waits for the training loop."""
+"""What a rollout worker spends time on: stepping environments, waiting for replies to pushes, waiting for a call."""
 
 
 class BlockReport(NamedTuple):
-    """What the training loop learns of a block; no transitions.
+    """What a rollout worker tells the training loop about a block, without its transitions.
 
-    `shard` and its incarnation say where it was pushed, `rows` how many transitions it holds; with a reason in
-    `dropped` none of them is stored, because of `fault` if the shard failed. `seconds` says where the worker's time
-    went since its last report (see ACTS, STORES, WAITS).
+    Fields: header and finished episodes of the block; transitions stored; age of the acting weights when the block was
+    stored, in updates and in seconds; transitions in the block; shard it was pushed to and the shard's incarnation;
+    why it was not stored, if it was not, and the shard's fault behind that; seconds that the worker has spent on each
+    activity since its last report (ACTS, STORES, WAITS).
     """
 
     header: BlockHeader
@@ -112,7 +115,7 @@ class BlockReport(NamedTuple):
 
 
 class Delivered(NamedTuple):
-    """What a shard has stored of one incarnation of a worker; `made` is the highest count in its headers."""
+    """Totals of the blocks that a shard has stored of one worker incarnation; `made` is the highest in its headers."""
 
     rows: int = 0
     env_steps: int = 0
@@ -121,21 +124,21 @@ class Delivered(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """How rows of a prioritised shard were drawn.
+    """How the rows of a prioritised sample were drawn.
 
-    `number` `[count]` tells a row apart from the one that may take its place (it is the how manieth that the shard
-    stored), `probability` `[count]` is with which the shard drew it.
+    `insertion_index` `[count]` counts the rows that the shard has stored: a slot's next row has another index, so that
+    stale priority updates are detected. `probability` `[count]` is the probability of the draw within the shard.
     """
 
-    number: NDArray[np.int64]
+    insertion_index: NDArray[np.int64]
     probability: NDArray[np.float64]
 
 
 class SampleReply(NamedTuple):
-    """Transitions drawn from a shard, and what the shard counts among all (see ReplayShard.mass).
+    """A sample of a shard's transitions.
 
-    `columns` are theirs, `[count, ...]` each, by the names of `transition_dtype`; `draws` tells how they were drawn,
-    None where all are drawn alike.
+    `columns` holds arrays `[count, ...]` under the names of `transition_dtype`. `mass` is the weight of the shard when
+    the learner chooses between shards (see ReplayShard.mass). `draws` is None if the shard samples uniformly.
     """
 
     columns: dict[str, NDArray[Any]]
@@ -144,10 +147,10 @@ class SampleReply(NamedTuple):
 
 
 def transition_dtype(observation_space: gym.spaces.Box) -> np.dtype[Any]:
-    """Row of one whole transition: (s_t, a_t, n-step reward, discount_t, s_{t+n}).
+    """Structured dtype of one unpacked n-step transition: (s_t, a_t, n-step return, discount, s_{t+n}).
 
-    `discount` is what the value of `next_observation` counts: gamma^n, and 0 where the task ended. A
-    timeout keeps its discount: it is no terminal state.
+    `discount` multiplies the value of `next_observation`: gamma^n, or 0 if the task terminated. A timeout keeps its
+    discount, since its last state is not terminal.
     """
     observation: Any = (observation_space.dtype, observation_space.shape)
     return np.dtype(

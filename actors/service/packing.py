@@ -1,8 +1,8 @@
-"""Transitions without repeats: an observation that a later row begins with is not stored a second time.
+"""Packed transitions: every observation is stored once.
 
-What a transition led to is, n steps later, what another one of the same environment began with. A packed row therefore
-names the row that it led to by its distance. Observations that no row begins with, an episode's last ones and those
-of steps that come with a later block, are kept beside the rows, as frames.
+The next observation of step t is the observation of step t + n of the same environment. A packed row therefore holds
+the distance to the row of step t + n in place of a copy. Some next observations are not the observation of any row: the
+last one of an episode, and those whose step belongs to a later block. These are stored beside the rows, as frames.
 """
 
 from __future__ import annotations
@@ -15,35 +15,36 @@ from numpy.typing import NDArray
 
 from sim_core.jit import inlined, kernel
 
-NUMBERS = 2**31
-"""Frames are known by their number among all that came, modulo this."""
+FRAME_MODULUS = 2**31
+"""Rows refer to the frames of a shard, counted in the order of insertion, modulo this number."""
 
-PART = 16
-"""Rows that are unpacked together: about as many reads as a core has under way at once."""
+BATCH_ROWS = 16
+"""Rows unpacked together, so that their cache misses overlap: about as many as a core has in flight."""
 
 
 class Packed(NamedTuple):
     """Transitions, oldest first.
 
-    rows: of `packed_dtype`; a positive `next_row` is the distance to the row that begins with what this one led to,
-      any other, negated, the number of the frame that it led to. These numbers count from 0, along the rows.
-    frames: what rows led to and no row begins with `[frames, *shape]`.
+    rows: `[count]` of `packed_dtype`. A positive `next_row` is the distance to the row whose observation is this row's
+      next observation. Otherwise the next observation is frame number `-next_row`. Frames are numbered from 0 in the
+      order of the rows that refer to them, one row each.
+    frames: next observations that are not the observation of any row `[frames, *shape]`.
     """
 
     rows: NDArray[Any]
     frames: NDArray[Any]
 
-    def is_sound(self, row: np.dtype[Any]) -> bool:
-        """Whether the rows have this layout, and lead to rows among them and to all of the frames in turn."""
+    def is_valid(self, row: np.dtype[Any]) -> bool:
+        """Whether the rows have dtype `row`, the frames the dtype and shape of its observation, and all links hold."""
         observation = row["observation"]
         frame = self.frames.dtype, self.frames.shape[1:]
         if self.rows.dtype != row or frame != (observation.base, observation.shape):
             return False
-        return leads(self.rows["next_row"], range(len(self.frames)))
+        return links_are_valid(self.rows["next_row"], range(len(self.frames)))
 
 
 def packed_dtype(transition: np.dtype[Any]) -> np.dtype[Any]:
-    """Layout of a packed row of such transitions (`actors.service.messages.transition_dtype`)."""
+    """Structured dtype of a packed row, from that of a transition (`actors.service.messages.transition_dtype`)."""
     return np.dtype(
         [
             ("reward", np.float32),
@@ -56,61 +57,73 @@ def packed_dtype(transition: np.dtype[Any]) -> np.dtype[Any]:
     )
 
 
-def frames_of(transitions: int, steps_per_block: int, n_step: int) -> int:
-    """Frames that so many transitions lead to after a block's last steps; those of ended episodes come on top."""
+def estimate_frames(transitions: int, steps_per_block: int, n_step: int) -> int:
+    """Frames that `transitions` transitions need because their blocks end; the ends of episodes add to this."""
     return transitions * min(n_step, steps_per_block) // steps_per_block
 
 
 def as_bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
-    """An array's entries as bytes `[len(array), bytes]`, the same memory where it is contiguous."""
+    """Views the entries of an array as bytes `[len(array), bytes]`; copies it if it is not contiguous."""
     size = array.dtype.itemsize * math.prod(array.shape[1:])
     return np.ascontiguousarray(array).view(np.uint8).reshape(len(array), size)
 
 
-def leads(next_row: NDArray[np.int32], frames: range) -> bool:
-    """Whether rows, oldest first, lead to rows among them and to all frames of these numbers in turn."""
-    return bool(_leads(next_row, frames.start, frames.stop))
+def links_are_valid(next_row: NDArray[np.int32], frames: range) -> bool:
+    """Whether all links of rows, oldest first, hold.
+
+    Args:
+      next_row: the rows' field `[rows]`.
+      frames: numbers of the frames present.
+
+    Returns:
+      Whether every positive `next_row` leads to one of the rows, and the others refer to all frames in order.
+    """
+    return bool(_links_are_valid(next_row, frames.start, frames.stop))
 
 
 @kernel
-def _leads(next_row: NDArray[np.int32], first: int, after: int) -> bool:
+def _links_are_valid(next_row: NDArray[np.int32], first: int, stop: int) -> bool:
     for i in range(len(next_row)):
         if next_row[i] > 0:
             if i + next_row[i] >= len(next_row):
                 return False
         else:
-            if first == after or -next_row[i] != first % NUMBERS:
+            if first == stop or -next_row[i] != first % FRAME_MODULUS:
                 return False
             first += 1
-    return first == after
+    return first == stop
 
 
 def count_frames(rows: NDArray[Any]) -> int:
-    """How many frames packed rows refer to."""
+    """Number of frames that packed rows refer to."""
     return int(np.count_nonzero(rows["next_row"] <= 0))
 
 
 class Fields(NamedTuple):
-    """The fields of packed rows, the rows as bytes `[rows, bytes]`, and where in these the observation begins."""
+    """Views of packed rows: their fields `[rows]`, and the whole rows as bytes `[rows, bytes]`.
+
+    `offset` is the byte of a row at which the observation starts. The types are the same for every observation space,
+    so that kernels compile once.
+    """
 
     reward: NDArray[np.float32]
     discount: NDArray[np.float32]
     action: NDArray[np.int32]
     next_row: NDArray[np.int32]
-    memory: NDArray[np.uint8]
-    place: int
+    row_bytes: NDArray[np.uint8]
+    offset: int
 
 
 def fields_of(rows: NDArray[Any]) -> Fields:
-    """Views of packed rows, for kernels: the same types whatever is observed."""
+    """Views of packed rows, for kernels."""
     fields = rows.dtype.fields
     assert fields is not None
-    place = fields["observation"][1]
-    return Fields(rows["reward"], rows["discount"], rows["action"], rows["next_row"], as_bytes(rows), place)
+    offset = fields["observation"][1]
+    return Fields(rows["reward"], rows["discount"], rows["action"], rows["next_row"], as_bytes(rows), offset)
 
 
-class _Drawn(NamedTuple):
-    """Columns of whole transitions, observations as bytes."""
+class _Columns(NamedTuple):
+    """Columns of unpacked transitions `[count]`, observations as bytes `[count, bytes]`."""
 
     reward: NDArray[np.float32]
     discount: NDArray[np.float32]
@@ -120,10 +133,10 @@ class _Drawn(NamedTuple):
 
 
 class Unpacker:
-    """Makes whole transitions of a ring of packed rows.
+    """Gathers unpacked transitions from a ring of packed rows.
 
     Args:
-      rows: the ring, whose memory is looked at in every call.
+      rows: the ring `[capacity]`; every call reads its present content.
     """
 
     def __init__(self, rows: NDArray[Any]) -> None:
@@ -132,59 +145,69 @@ class Unpacker:
         self._shape, self._dtype = observation.shape, observation.base
 
     def __call__(self, slots: NDArray[np.int64], frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Columns of whole transitions `[count, ...]`, by the names of `messages.transition_dtype`.
+        """Gathers the transitions at `slots` `[count]`.
 
         Args:
-          slots: which rows `[count]`.
-          frames: frame k stands at k modulo their number, a power of 2.
+          slots: slots of the ring `[count]`.
+          frames: ring of frames; frame k is in slot k modulo its length, a power of 2.
+
+        Returns:
+          Columns `[count, ...]` under the names of `messages.transition_dtype`.
         """
         count = len(slots)
         reward, discount, action = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.int32)
-        seen, reached = np.empty((2, count, *self._shape), self._dtype)
-        drawn = _Drawn(reward, discount, action, as_bytes(seen), as_bytes(reached))
-        _unpack(slots, self._ring, as_bytes(frames), drawn, np.empty(PART, np.int64))
+        observation, next_observation = np.empty((2, count, *self._shape), self._dtype)
+        out = _Columns(reward, discount, action, as_bytes(observation), as_bytes(next_observation))
+        _unpack(slots, self._ring, as_bytes(frames), out, np.empty(BATCH_ROWS, np.int64))
         columns = {"reward": reward, "discount": discount, "action": action}
-        return {**columns, "observation": seen, "next_observation": reached}
+        return {**columns, "observation": observation, "next_observation": next_observation}
 
 
 @kernel
 def _unpack(
-    slots: NDArray[np.int64], rows: Fields, frames: NDArray[np.uint8], out: _Drawn, reached: NDArray[np.int64]
+    slots: NDArray[np.int64], rows: Fields, frames: NDArray[np.uint8], out: _Columns, sources: NDArray[np.int64]
 ) -> None:
-    """Part after part of the slots, of the length of `reached`, whose reads are under way at once."""
-    capacity, mask, begin = len(rows.memory), len(frames) - 1, rows.place
+    """Unpacks batches of `len(sources)` slots.
+
+    `sources` is scratch memory: where the next observation of each slot is, slot r as r, frame slot f as -1 - f. The
+    middle loop touches all of a batch's next observations before the last loop copies them, so that their cache misses
+    overlap.
+    """
+    capacity, mask, begin = len(rows.row_bytes), len(frames) - 1, rows.offset
     end = begin + frames.shape[1]
-    for start in range(0, len(slots), len(reached)):
-        part = range(min(len(reached), len(slots) - start))
-        for i in part:
+    for start in range(0, len(slots), len(sources)):
+        batch = range(min(len(sources), len(slots) - start))
+        for i in batch:
             slot, ahead = slots[start + i], rows.next_row[slots[start + i]]
-            reached[i] = (slot + ahead) % capacity if ahead > 0 else -1 - (-ahead & mask)
+            sources[i] = (slot + ahead) % capacity if ahead > 0 else -1 - (-ahead & mask)
             out.reward[start + i], out.discount[start + i] = rows.reward[slot], rows.discount[slot]
             out.action[start + i] = rows.action[slot]
         if begin < end:
-            for i in part:
-                place = reached[i]
-                out.next_observation[start + i, 0] = rows.memory[place, begin] if place >= 0 else frames[-1 - place, 0]
-        for i in part:
-            place = reached[i]
-            copy_bytes(rows.memory[slots[start + i], begin:end], out.observation[start + i], 0)
-            if place >= 0:
-                copy_bytes(rows.memory[place, begin:end], out.next_observation[start + i], 0)
+            for i in batch:
+                source = sources[i]
+                out.next_observation[start + i, 0] = (
+                    rows.row_bytes[source, begin] if source >= 0 else frames[-1 - source, 0]
+                )
+        for i in batch:
+            source = sources[i]
+            copy_bytes(rows.row_bytes[slots[start + i], begin:end], out.observation[start + i], 0)
+            if source >= 0:
+                copy_bytes(rows.row_bytes[source, begin:end], out.next_observation[start + i], 0)
             else:
-                copy_bytes(frames[-1 - place], out.next_observation[start + i], 0)
+                copy_bytes(frames[-1 - source], out.next_observation[start + i], 0)
 
 
 @inlined
-def copy_bytes(source: NDArray[np.uint8], row: NDArray[np.uint8], place: int) -> None:
-    """Writes all of `source` to a row, from byte `place` on."""
-    target = row[place : place + len(source)]
+def copy_bytes(source: NDArray[np.uint8], row: NDArray[np.uint8], offset: int) -> None:
+    """Copies all of `source` into `row`, from byte `offset` on."""
+    target = row[offset : offset + len(source)]
     for i in range(len(source)):
         target[i] = source[i]
 
 
 @kernel
-def renumber(next_row: NDArray[np.int32], first: int) -> None:
-    """Adds `first` to the number of every frame that rows refer to, in place."""
+def renumber_frames(next_row: NDArray[np.int32], first: int) -> None:
+    """Adds `first` to the frame numbers that rows hold, in place."""
     for i in range(len(next_row)):
         if next_row[i] <= 0:
-            next_row[i] = -((first - next_row[i]) % NUMBERS)
+            next_row[i] = -((first - next_row[i]) % FRAME_MODULUS)

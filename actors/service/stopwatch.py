@@ -1,4 +1,4 @@
-"""Where the time of a part goes, hop by hop."""
+"""How a component divides its time between activities."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 
 class Stopwatch:
-    """Sums up seconds by what they were for; every moment after the first counts for one thing.
+    """Sums up seconds per activity; from the first lap on, every moment belongs to exactly one activity.
 
     Args:
-      clock: seconds.
+      clock: function that returns seconds.
     """
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -18,14 +18,14 @@ class Stopwatch:
         self._last_s: float | None = None
         self._seconds: dict[str, float] = {}
 
-    def lap(self, what: str) -> None:
-        """The time since the last lap was for `what`; before the first lap the watch stands still."""
+    def lap(self, activity: str) -> None:
+        """Adds the time since the last lap to `activity`; the first lap only starts the watch."""
         now_s = self._clock()
         if self._last_s is not None:
-            self._seconds[what] = self._seconds.get(what, 0.0) + now_s - self._last_s
+            self._seconds[activity] = self._seconds.get(activity, 0.0) + now_s - self._last_s
         self._last_s = now_s
 
     def take(self) -> dict[str, float]:
-        """The seconds by what they were for since the last call."""
+        """Returns the seconds per activity since the last call, and resets them."""
         seconds, self._seconds = self._seconds, {}
         return seconds

@@ -1,1 +1,1 @@
-"""Files: local or remote locations, zarr columns, durable writes."""
+"""Storage: local or remote locations, zarr columns, durable writes, and the heap of long-running processes."""

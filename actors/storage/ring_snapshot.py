@@ -1,7 +1,7 @@
-"""The rows of a ring as they were at one moment, read by another thread while the ring is written on.
+"""Copy-on-write snapshots of a ring buffer: another thread reads the rows of one moment while inserts continue.
 
-Copy on write: a piece is copied when the reader comes to it, or just before the ring overwrites it, whichever is
-first. So taking a snapshot costs nothing, whatever the ring holds, and no insert waits for more than a few pieces.
+A piece of the ring is copied when the reader reaches it, or just before an insert overwrites it, whichever comes first.
+So a snapshot costs nothing to take, whatever the size of the ring, and no insert waits for more than a few pieces.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 PIECE_ROWS = 4_096
-"""Rows that are copied at once."""
+"""Rows copied at a time."""
 
 
 class RingSnapshot:
-    """Rows 0..size of a ring at the moment of construction; may be read once, in ascending slices.
+    """Rows `0:size` of a ring at the moment of construction; may be read once, in ascending slices.
 
     Args:
-      rows: the ring's rows `[capacity]`; their owner calls `protect` before it overwrites any.
-      size: rows that count, from the first on.
+      rows: the ring `[capacity]`; its owner calls `protect` before it overwrites any row.
+      size: number of rows in the snapshot.
     """
 
     def __init__(self, rows: NDArray[Any], size: int) -> None:
@@ -33,15 +33,15 @@ class RingSnapshot:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Layout of the rows."""
+        """Structured dtype of the rows."""
         return self._ring.dtype
 
     def __len__(self) -> int:
-        """Rows of the snapshot."""
+        """Number of rows."""
         return self._size
 
     def protect(self, start: int, stop: int) -> None:
-        """Copies what has not been read yet of the pieces with ring rows start..stop, which are to be overwritten."""
+        """Saves the unread pieces that hold rows `start:stop`, which the ring is about to overwrite."""
         if start >= min(stop, self._size):
             return
         with self._lock:
@@ -53,7 +53,7 @@ class RingSnapshot:
         return self._ring[piece * PIECE_ROWS : min(self._size, (piece + 1) * PIECE_ROWS)].copy()
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Copies of the rows start..stop as they were; start is a multiple of PIECE_ROWS."""
+        """Copies rows `start:stop` as they were at the snapshot; `start` is a multiple of PIECE_ROWS."""
         pieces = []
         for piece in range(start // PIECE_ROWS, -(-min(stop, self._size) // PIECE_ROWS)):
             with self._lock:
@@ -63,7 +63,7 @@ class RingSnapshot:
         return np.concatenate(pieces) if pieces else self._ring[:0].copy()
 
     def close(self) -> None:
-        """Frees what was copied; inserts protect nothing any more."""
+        """Frees the copies; from now on `protect` does nothing."""
         with self._lock:
             self._size = 0
             self._saved.clear()

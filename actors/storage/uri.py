@@ -1,6 +1,6 @@
-"""Where a checkpoint's files lie: a local path, or an fsspec URL, whose files pass through a temporary folder.
+"""Where checkpoint files are: a local path, or an fsspec URL, whose files go through a temporary folder.
 
-A URL's storage has no rename and no fsync; what counts there is which file is written last.
+Object storage has neither rename nor fsync. What makes a checkpoint complete there is the file that is written last.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from actors.service.fault_policy import first_line
 from sim_core.checks import ConfigError
 
 Location = Path | str
-"""A local path, or a URL as text."""
+"""A local path, or a URL as a string."""
 
 
-def as_location(text: str) -> Location:
-    """The location that a user names; `file://` and plain paths are local.
+def parse_location(text: str) -> Location:
+    """Parses a location that a user gives; `file://` URLs and plain paths are local.
 
     Raises:
-      ConfigError: the URL holds a password.
+      ConfigError: the URL contains a user or password.
     """
     if "://" not in text:
         return Path(text).absolute()
@@ -38,13 +38,13 @@ def as_location(text: str) -> Location:
     return text.rstrip("/")
 
 
-def inside(location: Location, name: str) -> Location:
-    """The file or folder `name` of a location."""
+def join_location(location: Location, name: str) -> Location:
+    """Location of the file or folder `name` inside `location`."""
     return location / name if isinstance(location, Path) else f"{location}/{name}"
 
 
-def is_plain(name: str) -> bool:
-    """Whether a relative name, with `/` between its parts, stays inside whatever it is joined to."""
+def is_safe_name(name: str) -> bool:
+    """Whether a relative name with `/` as separator stays inside any folder that it is joined to."""
     parts = PurePosixPath(name).parts
     plain = "/".join(parts) == name and bool(parts) and ".." not in parts and not name.startswith("/")
     return plain and "\\" not in name and "\0" not in name
@@ -52,7 +52,7 @@ def is_plain(name: str) -> bool:
 
 @contextmanager
 def storage_errors(location: Location) -> Iterator[None]:
-    """Turns what a storage's client raises (each its own) into OSError that names the location."""
+    """Converts the errors of storage clients, each of which has its own types, to OSError with the location."""
     try:
         yield
     except (OSError, ConfigError):
@@ -62,10 +62,13 @@ def storage_errors(location: Location) -> Iterator[None]:
 
 
 def filesystem(url: str) -> tuple[Any, str]:
-    """The fsspec file system of a URL, which remembers no listings, and the URL's path in it.
+    """Opens the fsspec file system of a URL, without a cache of listings.
+
+    Returns:
+      (file system, path of the URL in it).
 
     Raises:
-      ConfigError: nothing here speaks the URL's protocol.
+      ConfigError: no installed package handles the URL's protocol.
     """
     try:
         found: tuple[Any, str] = url_to_fs(url, use_listings_cache=False)
@@ -78,10 +81,10 @@ def filesystem(url: str) -> tuple[Any, str]:
 
 
 def check_writable(url: str) -> None:
-    """Writes a small file to a URL and removes it.
+    """Writes a small file to a URL and removes it again.
 
     Raises:
-      ConfigError: that is not possible.
+      ConfigError: this failed.
     """
     try:
         with storage_errors(url):
@@ -96,7 +99,7 @@ def check_writable(url: str) -> None:
 
 @contextmanager
 def staged(location: Location) -> Iterator[Path]:
-    """A local path to write a file or folder to, which is at `location` once the `with` block has ended."""
+    """Yields a local path to write a file or folder to; after the `with` block its content is at `location`."""
     if isinstance(location, Path):
         location.parent.mkdir(parents=True, exist_ok=True)
         yield location
@@ -113,10 +116,10 @@ def staged(location: Location) -> Iterator[Path]:
 
 @contextmanager
 def fetched(location: Location) -> Iterator[Path]:
-    """A local path to read the file or folder at `location` from, within the `with` block.
+    """Yields a local path from which to read the file or folder at `location`, valid within the `with` block.
 
     Raises:
-      OSError: nothing is there, or a name there would lead elsewhere.
+      OSError: nothing is there, or a name there would escape the folder.
     """
     if isinstance(location, Path):
         yield location
@@ -129,8 +132,8 @@ def fetched(location: Location) -> Iterator[Path]:
                 raise FileNotFoundError(f"there is nothing at {location}")
             parent = path.rsplit("/", 1)[0] + "/"
             names = [file.removeprefix(parent) for file in found]
-            if not all(is_plain(name) for name in names):
-                raise OSError(f"{location} holds names that lead out of its folder")
+            if not all(is_safe_name(name) for name in names):
+                raise OSError(f"{location} contains names that lead out of its folder")
             local = [Path(folder) / name for name in names]
             for target in local:
                 target.parent.mkdir(parents=True, exist_ok=True)
@@ -139,6 +142,6 @@ def fetched(location: Location) -> Iterator[Path]:
 
 
 def files_under(path: Path) -> dict[str, Path]:
-    """Every file of a file or folder, by its name relative to the folder around `path`."""
+    """All files of a file or folder, by their names relative to the parent folder of `path`."""
     found = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
     return {file.relative_to(path.parent).as_posix(): file for file in sorted(found)}

@@ -1,7 +1,7 @@
-"""Packed rows in zarr, one array a column, so that anybody can read a saved replay or evaluation.
+"""Structured rows in zarr, one array per column, so that any zarr reader can open a saved replay or evaluation.
 
-A missing zarr chunk reads as zeros, so the columns' CRCs are stored beside them and checked on load. Only zarr format 3
-is read: among the codecs of format 2 is pickle, which runs what a file says.
+A missing zarr chunk reads as zeros, so each column's CRC-32 is stored with it and checked on load. Only zarr format 3
+is read: format 2 allows the pickle codec, which runs code from the file.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from actors.storage.ring_snapshot import RingSnapshot
 FORMAT = "shoal-replay-2"
 CHUNK_ROWS = 65_536
 """Rows of a zarr chunk; a multiple of `ring_snapshot.PIECE_ROWS`."""
-MOST_ROWS = 100_000_000
-"""Rows that a stored table may claim: memory is taken for them before they are read."""
+MAX_ROWS = 100_000_000
+"""Most rows that a stored table may declare, since memory is allocated for them before they are read."""
 
 
 def save_rows(path: Path, rows: NDArray[Any] | RingSnapshot, layout: str = FORMAT) -> None:
-    """Writes structured rows `[count]` to a new zarr group at `path`, whose format is named `layout`."""
+    """Writes structured rows `[count]` to a new zarr group at `path`; `layout` is stored as the name of its format."""
     root = zarr.open_group(str(path), mode="w", zarr_format=3)
     count, names = len(rows), rows.dtype.names or ()
     arrays = {name: _new_column(root, name, rows.dtype[name], count) for name in names}
     crc = dict.fromkeys(names, 0)
     for start in range(0, count, CHUNK_ROWS):
         stop = min(count, start + CHUNK_ROWS)
-        part = rows.read(start, stop) if isinstance(rows, RingSnapshot) else rows[start:stop]
+        piece = rows.read(start, stop) if isinstance(rows, RingSnapshot) else rows[start:stop]
         for name, array in arrays.items():
-            column = np.ascontiguousarray(part[name])
+            column = np.ascontiguousarray(piece[name])
             array[start:stop] = column
             crc[name] = zlib.crc32(column.data, crc[name])
     root.attrs.update({"format": layout, "rows": count, "crc32": crc})
@@ -46,10 +46,10 @@ def _new_column(root: zarr.Group, name: str, dtype: np.dtype[Any], count: int) -
 
 
 def open_store(path: Path) -> zarr.Group:
-    """A zarr group to read.
+    """Opens a zarr group for reading.
 
     Raises:
-      ValueError: there is none, or one of another zarr format than 3.
+      ValueError: there is no group, or its zarr format is not 3.
     """
     try:
         return zarr.open_group(str(path), mode="r", zarr_format=3)
@@ -57,11 +57,20 @@ def open_store(path: Path) -> zarr.Group:
         raise ValueError(f"{path} is missing or incomplete ({error})") from error
 
 
-def load_rows(path: Path, dtype: np.dtype[Any], layout: str = FORMAT, at_most: int = MOST_ROWS) -> NDArray[Any]:
-    """Reads rows of `dtype` that `save_rows` wrote under the same `layout`.
+def load_rows(path: Path, dtype: np.dtype[Any], layout: str = FORMAT, at_most: int = MAX_ROWS) -> NDArray[Any]:
+    """Reads rows that `save_rows` wrote.
+
+    Args:
+      path: the zarr group.
+      dtype: structured dtype of the rows.
+      layout: name of the format, as given to `save_rows`.
+      at_most: most rows to accept.
+
+    Returns:
+      `[count]` of `dtype`.
 
     Raises:
-      ValueError: the group is missing, damaged, has other columns, or claims more than `at_most` rows.
+      ValueError: the group is missing or damaged, has other columns, or declares more than `at_most` rows.
     """
     root = open_store(path)
     if root.attrs.get("format") != layout:
@@ -76,7 +85,7 @@ def _read_columns(path: Path, root: zarr.Group, dtype: np.dtype[Any], at_most: i
     attributes: Any = root.attrs.asdict()
     count = attributes["rows"]
     if not isinstance(count, int) or not 0 <= count <= at_most:
-        raise ValueError(f"{path} claims {count!r} rows; at most {at_most} can be")
+        raise ValueError(f"{path} claims {count!r} rows; at most {at_most} fit")
     names = dtype.names or ()
     arrays: dict[str, Any] = {name: root[name] for name in names}
     for name, array in arrays.items():  # before anything is allocated

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from actors.storage.uri import Location, as_location, check_writable, inside
+from actors.storage.uri import Location, check_writable, join_location, parse_location
 from learner.checkpoints.store import open_store
 from learner.run_folder import Storage
 from sim_core.checks import ConfigError, require
@@ -36,8 +36,8 @@ def make_folder(path: Path, flag: str) -> None:
 
 
 def run_location(checkpoint_url: str, name: str) -> Location:
-    """Where the checkpoints of the run `name` lie under `--checkpoint-url` (see `as_location` for errors)."""
-    return inside(as_location(checkpoint_url), name)
+    """Where the checkpoints of the run `name` lie under `--checkpoint-url` (see `parse_location` for errors)."""
+    return join_location(parse_location(checkpoint_url), name)
 
 
 def new_storage(checkpoint_url: str | None, name: str, keep_best: int) -> Storage:
@@ -48,7 +48,7 @@ def new_storage(checkpoint_url: str | None, name: str, keep_best: int) -> Storag
     """
     if checkpoint_url is None:
         return Storage(None, keep_best)
-    root, location = as_location(checkpoint_url), run_location(checkpoint_url, name)
+    root, location = parse_location(checkpoint_url), run_location(checkpoint_url, name)
     if isinstance(root, Path):
         make_folder(root, "--checkpoint-url")
     else:

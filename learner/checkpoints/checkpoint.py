@@ -1,6 +1,6 @@
 """Checkpoints: whole or not there, with a checksum of every file; a reader trusts only what its manifest vouches for.
 
-The nodes write their parts (`actors.storage.part_writer`), then the driver adds the state and, last, the manifest.
+The nodes write their parts (`actors.storage.fragment_writer`), then the driver adds the state and, last, the manifest.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from actors.storage.part_writer import FileSum
+from actors.storage.fragment_writer import FileSum
 from actors.storage.uri import Location
 from learner.checkpoints.manifest import (
     MANIFEST,

@@ -11,8 +11,8 @@ import json
 import re
 from typing import Any, NamedTuple
 
-from actors.storage.part_writer import FileSum
-from actors.storage.uri import is_plain
+from actors.storage.fragment_writer import FileSum
+from actors.storage.uri import is_safe_name
 from sim_core.checks import ConfigError
 
 VERSION = 5
@@ -62,7 +62,7 @@ def decode_manifest(data: bytes, where: object) -> Manifest:
     if values is None or not isinstance(files, dict) or STATE not in files or not _is_count(values.get("env_steps")):
         raise damaged(where, f"{MANIFEST} has other content than a manifest")
     for name, found in files.items():
-        if not is_plain(name) or name == MANIFEST:
+        if not is_safe_name(name) or name == MANIFEST:
             raise damaged(where, f"{MANIFEST} names {name!r}, which is no file of a checkpoint")
         if not _is_sum(found):
             raise damaged(where, f"{MANIFEST} gives {name!r} no length and SHA-256")

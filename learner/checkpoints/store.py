@@ -13,7 +13,7 @@ import uuid
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Protocol
 
-from actors.storage.part_writer import sync
+from actors.storage.fragment_writer import sync
 from actors.storage.uri import Location, filesystem, storage_errors
 from learner.checkpoints.manifest import MANIFEST
 

@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from actors.service.fault_policy import CallFailed, Fault, Part, PartFailed, first_line
+from actors.service.fault_policy import CallFailed, Component, ComponentFailed, Fault, first_line
 from actors.service.rpc import Calls, Node
-from actors.storage.part_writer import FileSum, Written, join_written
+from actors.storage.fragment_writer import FileSum, WriteResult, join_results
 from actors.storage.uri import Location
 from learner.checkpoints.checkpoint import Keep, complete_checkpoint, keep_checkpoints
 from learner.checkpoints.store import open_store
@@ -41,19 +41,19 @@ class Ended(NamedTuple):
     moment: Moment
     location: Location | None
     error: str | None
-    failure: PartFailed | None = None
+    failure: ComponentFailed | None = None
 
 
 class Writer(NamedTuple):
     """A part of the run that has been told to save itself: which, of which incarnation, and its node with `saved`."""
 
-    part: Part
+    component: Component
     incarnation: int
     node: Node
 
-    def failed(self, failure: CallFailed) -> PartFailed:
+    def failed(self, failure: CallFailed) -> ComponentFailed:
         """The failure as one of the part."""
-        return PartFailed(self.part, self.incarnation, failure.fault, f"saved: {failure.reason}")
+        return ComponentFailed(self.component, self.incarnation, failure.fault, f"saved: {failure.reason}")
 
 
 class GivenUp(Exception):
@@ -108,7 +108,7 @@ class Checkpointer:
 
         self._start(moment, write)
 
-    def drop(self, moment: Moment, writers: list[Writer], failure: PartFailed) -> None:
+    def drop(self, moment: Moment, writers: list[Writer], failure: ComponentFailed) -> None:
         """Waits in the background until `writers` are ready for another checkpoint: this one could not begin.
 
         Args:
@@ -134,7 +134,7 @@ class Checkpointer:
             write()
         except Exception as error:  # a disk's, a storage client's, Ray's: each raises its own, and training goes on
             # a new one: references in the traceback must not outlive Ray
-            failure = PartFailed(*error.args) if isinstance(error, PartFailed) else None
+            failure = ComponentFailed(*error.args) if isinstance(error, ComponentFailed) else None
             self._ended = self._ended or Ended(moment, None, first_line(error), failure)
             self._tidy()
 
@@ -152,7 +152,7 @@ class Checkpointer:
             for writer in list(waiting):
                 try:
                     answer = self._ask(writer)
-                except PartFailed as failure:
+                except ComponentFailed as failure:
                     failures.append(failure)
                     waiting.remove(writer)
                     continue
@@ -160,7 +160,7 @@ class Checkpointer:
                     written.append(answer)
                     waiting.remove(writer)
             if waiting and time.monotonic() > deadline_s:
-                late = ", ".join(sorted(str(writer.part) for writer in waiting))
+                late = ", ".join(sorted(str(writer.component) for writer in waiting))
                 raise TimeoutError(f"{late} did not write within {DEADLINE_S:.0f} s")
             if waiting and self._given_up.wait(POLL_S):
                 raise GivenUp
@@ -168,11 +168,11 @@ class Checkpointer:
             raise failures[0]
         return _files(written)
 
-    def _ask(self, writer: Writer) -> Written | None:
+    def _ask(self, writer: Writer) -> WriteResult | None:
         """How a part's write ended; None while it is being written.
 
         Raises:
-          PartFailed: it does not answer.
+          ComponentFailed: it does not answer.
           GivenUp: the run does not go on like this.
         """
         late_s = time.monotonic() + self._patience_s
@@ -183,7 +183,7 @@ class Checkpointer:
                     raise GivenUp
                 if time.monotonic() > late_s:
                     raise CallFailed(Fault.LATE, f"silent for {self._patience_s:.0f} s")
-            answer: Written | None = self._calls.get(ref)
+            answer: WriteResult | None = self._calls.get(ref)
         except CallFailed as failure:
             raise writer.failed(failure) from failure
         return answer
@@ -206,13 +206,13 @@ class Checkpointer:
         self.wait()
 
 
-def _files(written: list[Written]) -> dict[str, FileSum]:
+def _files(written: list[WriteResult]) -> dict[str, FileSum]:
     """The files of all parts.
 
     Raises:
       OSError: one could not be written.
     """
-    joined = join_written([*written])
+    joined = join_results([*written])
     assert joined is not None
     if joined.error is not None:
         raise OSError(joined.error)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from actors.policy.network import NETWORKS, DuelingNetwork, QNetwork, WeightsSnapshot, load_snapshot, snapshot
 from actors.rollout.vector_env import EnvShape
-from actors.storage.uri import fetched, inside
+from actors.storage.uri import fetched, join_location
 from learner.checkpoints.checkpoint import Checkpoint
 from learner.checkpoints.manifest import CheckpointError, damaged
 from learner.config import RunConfig
@@ -29,7 +29,7 @@ def read_policy(checkpoint: Checkpoint, config: RunConfig, shape: EnvShape) -> W
     if type(updates) is not int:
         raise damaged(checkpoint.folder, "state.json has no number of updates")
     network = NETWORKS[config.network](shape.observation_size, config.hidden_sizes, shape.num_actions)
-    with fetched(inside(checkpoint.folder, WEIGHTS)) as path:
+    with fetched(join_location(checkpoint.folder, WEIGHTS)) as path:
         return _read(path, updates, network)
 
 

@@ -29,11 +29,11 @@ from ray.exceptions import (
     WorkerCrashedError,
 )
 
-from actors.evaluation.evaluator import Candidate, evaluate_in_parts
+from actors.evaluation.evaluator import Candidate, evaluate_in_parallel
 from actors.replay.node import ShardNode
 from actors.rollout.node import RolloutNode
 from actors.rollout.vector_env import EnvSpec, env_shape
-from actors.service.fault_policy import CallFailed, Fault, PartFailed, first_line
+from actors.service.fault_policy import CallFailed, ComponentFailed, Fault, first_line
 from actors.service.messages import EpisodeStats
 from actors.service.rpc import LocalCalls, Node, Ref
 from learner.config import RunConfig
@@ -80,7 +80,7 @@ def _as_fault(error: Exception) -> Exception:
     """What an error of Ray means; what our own code raised stays as it is."""
     if isinstance(error, RayTaskError):
         cause = getattr(error, "cause", None)
-        if isinstance(cause, CallFailed | PartFailed):
+        if isinstance(cause, CallFailed | ComponentFailed):
             return cause
         return _as_fault(cause) if isinstance(cause, RayError) else error
     for kinds, fault in FAULTS:
@@ -228,7 +228,7 @@ def evaluate_in_tasks(spec: EnvSpec, candidate: Candidate, seeds: list[int], add
     connect(1, address)
     calls = RayCalls(DEADLINE_S)
     try:
-        return evaluate_in_parts(calls, spec, calls.put(candidate), seeds, cluster_cpus())
+        return evaluate_in_parallel(calls, spec, calls.put(candidate), seeds, cluster_cpus())
     finally:
         leave()
 

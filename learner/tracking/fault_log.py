@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from actors.service.fault_policy import Decision, Mended, PartFailed
+from actors.service.fault_policy import ComponentFailed, Decision, Recovered
 
 DRIVER = "driver"
 Event = Literal["failed", "mended", "resumed"]
@@ -35,13 +35,13 @@ class FaultLog:
     def __init__(self, path: Path) -> None:
         self._path = path
 
-    def failed(self, failure: PartFailed, decision: Decision) -> None:
+    def failed(self, failure: ComponentFailed, decision: Decision) -> None:
         """Notes a failure and the decision about it."""
-        self._append("failed", str(failure.part), failure.fault, decision.action, decision.attempts, 0.0)
+        self._append("failed", str(failure.component), failure.fault, decision.action, decision.attempts, 0.0)
 
-    def mended(self, mended: Mended) -> None:
+    def mended(self, mended: Recovered) -> None:
         """Notes that a part works again."""
-        self._append("mended", str(mended.part), mended.fault, mended.action, mended.attempts, mended.seconds)
+        self._append("mended", str(mended.component), mended.fault, mended.action, mended.attempts, mended.seconds)
 
     def resumed(self) -> None:
         """Notes that another driver goes on with the run."""

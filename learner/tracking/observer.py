@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from actors.service.fault_policy import Decision, Mended, PartFailed
+from actors.service.fault_policy import ComponentFailed, Decision, Recovered
 from actors.storage.uri import Location
 from learner.tracking.delivery import Delivery
 from learner.tracking.fault_log import FaultLog
@@ -67,12 +67,12 @@ class MirroringObserver:
         """Says so; the next checkpoint is tried as usual."""
         self._display.message(f"the checkpoint of {env_steps:,} env steps could not be written: {reason}")
 
-    def failed(self, failure: PartFailed, decision: Decision) -> None:
+    def failed(self, failure: ComponentFailed, decision: Decision) -> None:
         """Logs and shows a failure."""
         self._faults.failed(failure, decision)
         self._display.message(f"{failure}: {decision.action}")
 
-    def mended(self, mended: Mended) -> None:
+    def mended(self, mended: Recovered) -> None:
         """Logs and shows that a part works again."""
         self._faults.mended(mended)
-        self._display.message(f"{mended.part} works again after {mended.seconds:.1f} s")
+        self._display.message(f"{mended.component} works again after {mended.seconds:.1f} s")

@@ -8,7 +8,7 @@ import psutil
 
 from actors.rollout.vector_env import EnvShape, env_shape
 from actors.service.messages import transition_dtype
-from actors.service.packing import frames_of, packed_dtype
+from actors.service.packing import estimate_frames, packed_dtype
 from learner.config import RunConfig
 from sim_core.checks import require
 
@@ -30,7 +30,7 @@ def parts_bytes(config: RunConfig, shape: EnvShape) -> dict[str, int]:
     """Bytes of each part, by the settings that decide its size."""
     transition = transition_dtype(shape.observation_space)
     row, packed = transition.itemsize, packed_dtype(transition).itemsize
-    frames = frames_of(config.replay_capacity, config.steps_per_block, config.n_step)
+    frames = estimate_frames(config.replay_capacity, config.steps_per_block, config.n_step)
     priority = PRIORITY_BYTES if config.replay == "prioritised" else 0
     widths = [shape.observation_size, *config.policy_sizes, shape.num_actions]
     weights = sum(inputs * outputs + outputs for inputs, outputs in itertools.pairwise(widths))

@@ -8,13 +8,13 @@ from typing import Any, Protocol
 from actors.service.fault_policy import (
     Action,
     CallFailed,
+    Component,
+    ComponentFailed,
+    ComponentKind,
     Decision,
     Fault,
-    Mended,
-    Part,
-    PartFailed,
-    PartKind,
-    Recovery,
+    FaultTracker,
+    Recovered,
     RunFailed,
 )
 from actors.service.messages import BlockReport, Delivered
@@ -36,7 +36,7 @@ class RunLost(Exception):
       incarnation: the highest that the run has used.
     """
 
-    def __init__(self, failure: PartFailed, incarnation: int) -> None:
+    def __init__(self, failure: ComponentFailed, incarnation: int) -> None:
         super().__init__(str(failure))
         self.incarnation = incarnation
 
@@ -44,11 +44,11 @@ class RunLost(Exception):
 class FaultObserver(Protocol):
     """What is told of failures."""
 
-    def failed(self, failure: PartFailed, decision: Decision) -> None:
+    def failed(self, failure: ComponentFailed, decision: Decision) -> None:
         """A part failed, and this will be done about it."""
         ...
 
-    def mended(self, mended: Mended) -> None:
+    def mended(self, mended: Recovered) -> None:
         """A part that had failed works again."""
         ...
 
@@ -68,7 +68,7 @@ class Mender:
     def __init__(
         self,
         cluster: Cluster,
-        recovery: Recovery,
+        recovery: FaultTracker,
         under_way: UnderWay,
         pacer: Pacer,
         ledger: Ledger,
@@ -80,43 +80,43 @@ class Mender:
         self._pacer = pacer
         self._ledger = ledger
         self._observer = observer
-        self._incarnations: dict[Part, int] = {}
+        self._incarnations: dict[Component, int] = {}
         self.highest = cluster.incarnation
         """The highest incarnation so far; the next restart, of whichever part, gets the one after."""
 
-    def incarnation(self, part: Part) -> int:
+    def incarnation(self, part: Component) -> int:
         """The part's present incarnation: of a shard, 0 for its first in this sitting."""
-        return self._incarnations.get(part, 0 if part.kind is PartKind.SHARD else self._cluster.incarnation)
+        return self._incarnations.get(part, 0 if part.kind is ComponentKind.SHARD else self._cluster.incarnation)
 
-    def node(self, part: Part) -> Node:
+    def node(self, part: Component) -> Node:
         """Where the part is."""
-        if part.kind is PartKind.LEARNER:
+        if part.kind is ComponentKind.LEARNER:
             return self._cluster.learner
-        return (self._cluster.workers if part.kind is PartKind.WORKER else self._cluster.targets)[part.number]
+        return (self._cluster.workers if part.kind is ComponentKind.WORKER else self._cluster.targets)[part.number]
 
     @property
-    def workers(self) -> list[Part]:
+    def workers(self) -> list[Component]:
         """The rollout workers."""
-        return [Part(PartKind.WORKER, worker_id) for worker_id in range(len(self._cluster.workers))]
+        return [Component(ComponentKind.WORKER, worker_id) for worker_id in range(len(self._cluster.workers))]
 
-    def ask(self, part: Part, method: str, *args: Any) -> Any:
+    def ask(self, part: Component, method: str, *args: Any) -> Any:
         """Calls a part and waits for the answer.
 
         Raises:
-          PartFailed: there is none.
+          ComponentFailed: there is none.
         """
         return self.ask_all(method, {part: args})[0]
 
-    def ask_all(self, method: str, args: dict[Part, tuple[Any, ...]]) -> list[Any]:
+    def ask_all(self, method: str, args: dict[Component, tuple[Any, ...]]) -> list[Any]:
         """Calls several parts at once, each with its own arguments, and waits for their answers, in order.
 
         Raises:
-          PartFailed: one is missing.
+          ComponentFailed: one is missing.
         """
         refs = {part: self._cluster.calls.start(self.node(part), method, *given) for part, given in args.items()}
         return [self._answer(part, method, ref) for part, ref in refs.items()]
 
-    def _answer(self, part: Part, method: str, ref: Ref) -> Any:
+    def _answer(self, part: Component, method: str, ref: Ref) -> Any:
         calls = self._cluster.calls
         patience_s = self._cluster.start_deadline_s if method in SLOW else self._under_way.patience_with(part)
         try:
@@ -125,7 +125,7 @@ class Mender:
             answer = calls.get(ref)
         except CallFailed as failure:
             reason = f"{method}: {failure.reason}"
-            raise PartFailed(part, self.incarnation(part), failure.fault, reason) from failure
+            raise ComponentFailed(part, self.incarnation(part), failure.fault, reason) from failure
         self._under_way.heard(part)
         return answer
 
@@ -133,14 +133,18 @@ class Mender:
         """A reference to the learner's weights, which may not be there yet."""
         return self._cluster.calls.start(self._cluster.learner, "weights")
 
-    def target(self, index: int) -> Part:
+    def target(self, index: int) -> Component:
         """What workers push to under this index."""
-        return Part(PartKind.SHARD, index) if self._cluster.shards_are_parts else Part(PartKind.LEARNER)
+        return (
+            Component(ComponentKind.SHARD, index)
+            if self._cluster.shards_are_parts
+            else Component(ComponentKind.LEARNER)
+        )
 
-    def check_push(self, report: BlockReport) -> PartFailed | None:
+    def check_push(self, report: BlockReport) -> ComponentFailed | None:
         """What a worker's push says of where it went; one that went to a replaced shard is told of the new one."""
         target, pushed_to = self.target(report.shard), report.shard_incarnation
-        if target.kind is PartKind.LEARNER:
+        if target.kind is ComponentKind.LEARNER:
             pushed_to = self._cluster.incarnation
         elif pushed_to < self.incarnation(target):
             self._tell(report.header.worker_id, target)
@@ -148,20 +152,20 @@ class Mender:
         if report.fault is None:
             self.worked(target)
             return None
-        return PartFailed(target, pushed_to, report.fault, "a push to it failed")
+        return ComponentFailed(target, pushed_to, report.fault, "a push to it failed")
 
-    def _tell(self, worker_id: int, shard: Part) -> None:
+    def _tell(self, worker_id: int, shard: Component) -> None:
         """Names a worker the present incarnation of a shard."""
         node, incarnation = self.node(shard), self.incarnation(shard)
         self._cluster.calls.start(self._cluster.workers[worker_id], "replace_shard", shard.number, node, incarnation)
 
-    def worked(self, part: Part) -> None:
+    def worked(self, part: Component) -> None:
         """Notes that a part has done a call."""
-        mended = self._recovery.worked(part, time.monotonic())
+        mended = self._recovery.record_success(part, time.monotonic())
         if mended is not None:
             self._observer.mended(mended)
 
-    def decide(self, failure: PartFailed) -> Action:
+    def decide(self, failure: ComponentFailed) -> Action:
         """Asks the decision table, and tells the observer.
 
         Returns:
@@ -171,7 +175,7 @@ class Mender:
           RunLost: the run must go on from its last checkpoint.
           RunFailed: it cannot go on.
         """
-        decision = self._recovery.failed(failure, time.monotonic())
+        decision = self._recovery.record_failure(failure, time.monotonic())
         self._observer.failed(failure, decision)
         if decision.action is Action.STOP:
             raise RunFailed(f"{failure}, {decision.attempts} times in a row; mend the cause, then go on with resume")
@@ -179,7 +183,7 @@ class Mender:
             raise RunLost(failure, self.highest)
         return decision.action
 
-    def mend(self, failure: PartFailed) -> Delivered:
+    def mend(self, failure: ComponentFailed) -> Delivered:
         """Does what there is to do about a failure; nothing if the part has been replaced since.
 
         Args:
@@ -192,19 +196,19 @@ class Mender:
           RunLost: see `decide`.
           RunFailed: see `decide`.
         """
-        if failure.incarnation < self.incarnation(failure.part):
+        if failure.incarnation < self.incarnation(failure.component):
             return Delivered()
         if self.decide(failure) is Action.RETRY:
-            for ref in self._under_way.forget(failure.part):
+            for ref in self._under_way.forget(failure.component):
                 self._cluster.discard(ref)  # it may only be late
             return Delivered()
         while True:
             try:
-                if failure.part.kind is PartKind.WORKER:
-                    return self._restart_worker(failure.part)
-                return self._restart_shard(failure.part)
-            except PartFailed as another:
-                if another.part == failure.part:
+                if failure.component.kind is ComponentKind.WORKER:
+                    return self._restart_worker(failure.component)
+                return self._restart_shard(failure.component)
+            except ComponentFailed as another:
+                if another.component == failure.component:
                     return self.mend(another)
                 self.mend(another)
 
@@ -212,7 +216,7 @@ class Mender:
         self.highest += 1
         return self.highest
 
-    def _restart_worker(self, part: Part) -> Delivered:
+    def _restart_worker(self, part: Component) -> Delivered:
         cluster, index = self._cluster, part.number
         cluster.discard(cluster.workers[index])
         closed, incarnation = self.incarnation(part), self._next_incarnation()
@@ -229,7 +233,7 @@ class Mender:
         cluster.calls.start(worker, "set_weights", self.weights_ref())
         return unreported
 
-    def _restart_shard(self, part: Part) -> Delivered:
+    def _restart_shard(self, part: Component) -> Delivered:
         cluster, index = self._cluster, part.number
         cluster.discard(cluster.targets[index])
         self._under_way.forget(part)
@@ -237,7 +241,7 @@ class Mender:
         shard = cluster.targets[index] = cluster.place_shard(index, incarnation)
         self.ask(part, "size")  # others must not wait for it while it starts
         self._pacer.lost(self._ledger.shard_lost(index, incarnation))
-        self.ask(Part(PartKind.LEARNER), "replace_shard", index, shard, incarnation)
+        self.ask(Component(ComponentKind.LEARNER), "replace_shard", index, shard, incarnation)
         for worker_id in range(len(cluster.workers)):
             self._tell(worker_id, part)
         return Delivered()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from actors.service.fault_policy import Part, PartFailed, PartKind
-from actors.storage.uri import Location, inside
+from actors.service.fault_policy import Component, ComponentFailed, ComponentKind
+from actors.storage.uri import Location, join_location
 from learner.checkpoints.checkpoint import Checkpoint, Keep
 from learner.checkpoints.retention import Scored, scores_of
 from learner.checkpoints.writer import Checkpointer, Ended, Moment, Writer
@@ -14,7 +14,7 @@ from learner.tracking.journal import Journal
 from learner.training.counters import Progress
 from learner.training.recovery import Mender
 
-LEARNER = Part(PartKind.LEARNER)
+LEARNER = Component(ComponentKind.LEARNER)
 
 
 class SaveObserver(Protocol):
@@ -81,21 +81,23 @@ class Saver:
         """Begins a checkpoint while nothing is under way.
 
         Raises:
-          PartFailed: a part could not begin; the checkpoint stays wanted.
+          ComponentFailed: a part could not begin; the checkpoint stays wanted.
         """
         moment = Moment(self._progress.env_steps, self._progress.updates, self._journal.length)
         draft = self._checkpointer.draft(moment.env_steps)
         writers = [Writer(part, self._mender.incarnation(part), self._mender.node(part)) for part in self._parts()]
         try:
             state = self._state(draft, moment)
-        except PartFailed as failure:
+        except ComponentFailed as failure:
             self.is_wanted = True
-            self._checkpointer.drop(moment, [writer for writer in writers if writer.part != failure.part], failure)
+            self._checkpointer.drop(
+                moment, [writer for writer in writers if writer.component != failure.component], failure
+            )
             raise
         self.is_wanted = False
         self._checkpointer.begin(moment, draft, state, writers, lambda: self._seal(moment))
 
-    def _parts(self) -> list[Part]:
+    def _parts(self) -> list[Component]:
         return [LEARNER, *self._mender.workers]
 
     def _state(self, draft: Location, moment: Moment) -> dict[str, Any]:
@@ -117,11 +119,11 @@ class Saver:
         self._scored_to = moment.journal_offset
         return Keep(self._config.keep_checkpoints, self._keep_best, list(self._scores))
 
-    def poll(self) -> PartFailed | None:
+    def poll(self) -> ComponentFailed | None:
         """Tells of a checkpoint that has ended; a part that failed meanwhile is the caller's to mend."""
         return self._take(self._checkpointer.poll())
 
-    def wait(self) -> PartFailed | None:
+    def wait(self) -> ComponentFailed | None:
         """As `poll`, once the one that is being written has ended."""
         return self._take(self._checkpointer.wait())
 
@@ -129,7 +131,7 @@ class Saver:
         """Ends what is being written (see `Checkpointer.give_up`)."""
         self._checkpointer.give_up()
 
-    def _take(self, ended: Ended | None) -> PartFailed | None:
+    def _take(self, ended: Ended | None) -> ComponentFailed | None:
         if ended is None:
             return None
         moment = ended.moment
@@ -146,7 +148,7 @@ class Saver:
 
         Raises:
           ValueError: its files do not fit this run.
-          PartFailed: a part failed.
+          ComponentFailed: a part failed.
         """
         folder, state = checkpoint
         self._mender.ask(LEARNER, "load", folder, state["learner"])
@@ -156,5 +158,5 @@ class Saver:
         self._saved, self._saved_at = folder, (self._progress.env_steps, self._progress.updates)
 
 
-def _worker_file(folder: Location, worker: Part) -> Location:
-    return inside(folder, f"worker-{worker.number}.safetensors")
+def _worker_file(folder: Location, worker: Component) -> Location:
+    return join_location(folder, f"worker-{worker.number}.safetensors")

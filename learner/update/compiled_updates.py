@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from actors.policy.mlp_kernels import Floats, Layers, best_of, forward, make_room, multiply, squared_norm
+from actors.policy.mlp_kernels import Floats, Layers, best_action, forward, make_workspace, multiply, squared_norm
 from learner.update.gradients import FlatNetwork
 from learner.update.updates import LearnerSettings, UpdateStats
 from sim_core.jit import inlined, kernel
@@ -91,7 +91,7 @@ class CompiledUpdates:
             group["betas"][1],
             group["eps"],
         )
-        seen, other = (make_room(self._size, self._layers) for _ in range(2))
+        seen, other = (make_workspace(self._size, self._layers) for _ in range(2))
         self._room = _Room(seen, other, *np.zeros((2, self._size), np.float32))
         self._compile()
 
@@ -192,7 +192,7 @@ def _goals(rows: _Rows, start: int, online: Layers, target: Layers, room: _Room,
         _values(rows.s_t, start, online, room.seen)
         chooser = room.seen[-1]
     for row in range(len(room.goal)):
-        best = best_of(chooser, row)
+        best = best_action(chooser, row)
         room.goal[row] = rows.r_t[start + row] + rows.discount_t[start + row] * q_t[row, best]
 
 

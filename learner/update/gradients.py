@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from actors.policy.network import DuelingNetwork, QNetwork, folded_head
+from actors.policy.network import DuelingNetwork, QNetwork, fold_dueling_head
 from learner.update.double_dqn import Batch, LossName, double_q_target, mean_loss, q_target, targets
 
 Layer = tuple[Tensor, Tensor]
@@ -161,7 +161,7 @@ def _plain_layers(network: FlatNetwork) -> list[Layer]:
     if not isinstance(network.network, DuelingNetwork):
         return network.layers
     *layers, value, advantage = network.layers
-    return [*layers, folded_head(value, advantage)]
+    return [*layers, fold_dueling_head(value, advantage)]
 
 
 def _unfold_slopes(weight_slope: Tensor, bias_slope: Tensor, value: Layer, advantage: Layer) -> None:

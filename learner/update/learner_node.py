@@ -13,12 +13,12 @@ from safetensors.torch import load_file, save_file
 
 from actors.policy.network import WeightsSnapshot
 from actors.replay.node import ShardNode
-from actors.service.fault_policy import CallFailed, Part, PartFailed, PartKind
+from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind
 from actors.service.messages import STORES, WAITS, AddReply, Delivered, Draws, SampleReply, TransitionBlock
 from actors.service.rpc import Calls, Node, Ref
 from actors.service.stopwatch import Stopwatch
-from actors.storage.part_writer import PartWriter, Written, join_written
-from actors.storage.uri import Location, fetched, inside
+from actors.storage.fragment_writer import FragmentWriter, WriteResult, join_results
+from actors.storage.uri import Location, fetched, join_location
 from learner.update.double_dqn import importance_weights
 from learner.update.learner import Learner
 from learner.update.prefetch import DrawAhead, DrawWhenAsked
@@ -77,7 +77,7 @@ class LearnerNode:
         self._masses = np.zeros(len(shards), np.float64)
         self._answers: dict[int, Ref] = {}
         self._samples = DrawAhead(self._sample) if draws_ahead else DrawWhenAsked(self._sample)
-        self._writer = PartWriter()
+        self._writer = FragmentWriter()
         self._watch = Stopwatch()
         self.publish()
 
@@ -107,13 +107,13 @@ class LearnerNode:
         """What a call of the shard of this index gave.
 
         Raises:
-          PartFailed: the shard failed; nothing has been learned meanwhile.
+          ComponentFailed: the shard failed; nothing has been learned meanwhile.
         """
         try:
             return self._shard_calls.get(ref)
         except CallFailed as failure:
-            part = Part(PartKind.SHARD, index)
-            raise PartFailed(part, self._shard_incarnations[index], failure.fault, failure.reason) from failure
+            part = Component(ComponentKind.SHARD, index)
+            raise ComponentFailed(part, self._shard_incarnations[index], failure.fault, failure.reason) from failure
 
     def _slow_result(self, index: int, ref: Ref) -> Any:
         """`_result` of a call that reads a whole shard; the caller's deadline is for all of them."""
@@ -169,7 +169,7 @@ class LearnerNode:
         drawn = [(chances[i], reply.draws) for i, reply in zip(asked, replies, strict=True) if reply.draws is not None]
         if not drawn:
             return Sample(columns, None, None)
-        number = np.concatenate([draws.number for _, draws in drawn])[order]
+        number = np.concatenate([draws.insertion_index for _, draws in drawn])[order]
         probability = np.concatenate([chance * draws.probability for chance, draws in drawn])[order]
         return Sample(columns, np.repeat(asked, shares[asked])[order], Draws(number, probability))
 
@@ -178,7 +178,7 @@ class LearnerNode:
         assert sample.draws is not None
         for i in np.unique(sample.shard) if sample.shard is not None else [0]:
             mine = slice(None) if sample.shard is None else sample.shard == i
-            answer = (sample.draws.number[mine], self._learner.td_errors[mine])
+            answer = (sample.draws.insertion_index[mine], self._learner.td_errors[mine])
             self._answers[int(i)] = self._shard_calls.start(self._shards[i], "set_priorities", *answer)
 
     def _take_answers(self) -> None:
@@ -198,34 +198,34 @@ class LearnerNode:
           The rest of their state, for JSON.
 
         Raises:
-          PartFailed: a shard failed.
+          ComponentFailed: a shard failed.
         """
         self._take_answers()
         tensors = self._learner.get_state()
-        self._writer.start(inside(folder, WEIGHTS), lambda path: save_file(tensors, str(path)))
+        self._writer.start(join_location(folder, WEIGHTS), lambda path: save_file(tensors, str(path)))
         refs = [
             self._shard_calls.start(shard, "save", _shard_folder(folder, i)) for i, shard in enumerate(self._shards)
         ]
         shards = [self._result(i, ref) for i, ref in enumerate(refs)]
         return {"shards": shards, "rng": self._rng.bit_generator.state, "sizes": self._masses.tolist()}
 
-    def saved(self, timeout_s: float = 0.0) -> Written | None:
+    def saved(self, timeout_s: float = 0.0) -> WriteResult | None:
         """How the last `save` ended, all shards included; None while something of it is being written.
 
         Args:
           timeout_s: how long to wait for each.
 
         Raises:
-          PartFailed: a shard failed, and the others have written.
+          ComponentFailed: a shard failed, and the others have written.
         """
         parts, failures = [self._writer.result(timeout_s)], []
         refs = [self._shard_calls.start(shard, "saved", timeout_s) for shard in self._shards]
         for i, ref in enumerate(refs):
             try:
                 parts.append(self._result(i, ref))
-            except PartFailed as failure:
+            except ComponentFailed as failure:
                 failures.append(failure)
-        written = join_written(parts)
+        written = join_results(parts)
         if written is not None and failures:
             raise failures[0]
         return written
@@ -236,7 +236,7 @@ class LearnerNode:
         Raises:
           ValueError: the files are damaged or do not fit this run.
         """
-        location = inside(folder, WEIGHTS)
+        location = join_location(folder, WEIGHTS)
         try:
             with fetched(location) as path:
                 self._learner.set_state(load_file(str(path)))
@@ -262,4 +262,4 @@ class LearnerNode:
 
 
 def _shard_folder(folder: Location, shard: int) -> Location:
-    return inside(folder, f"shard-{shard}.zarr")
+    return join_location(folder, f"shard-{shard}.zarr")

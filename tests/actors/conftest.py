@@ -21,17 +21,17 @@ def _random_weights(spec, hidden_sizes=(16,), seed=0, version=0, time_s=0.0):
 
 @pytest.fixture(scope="session")
 def swarm():
-    """Spec of our own environment with short episodes that end in several ways."""
+    """Spec of the swarm environment with short episodes that end in several ways."""
     return EnvSpec(ENV_ID, WorldConfig(robots=4, groups=2, arena_radius_m=2.0, horizon_steps=25))
 
 
 @pytest.fixture(scope="session")
 def cart_pole():
-    """Spec of an environment that is not ours and names no outcomes."""
+    """Spec of another environment, which reports no outcomes."""
     return EnvSpec("CartPole-v1", WorldConfig())
 
 
 @pytest.fixture(scope="session")
 def make_weights():
-    """Function: random WeightsSnapshot that fits a spec; takes hidden_sizes, seed, version, time_s."""
+    """Function: a random WeightsSnapshot for a spec; takes hidden_sizes, seed, version, time_s."""
     return _random_weights

@@ -6,11 +6,11 @@ import numpy as np
 from numba import njit
 
 from sim_core.config import WorldConfig
-from sim_core.segregation import mean_goal_distance_m, segregated_fraction
 from sim_core.worlds import WorldBatch
 from tests.sim_core.orca_scenes import goal_scene, heading_scene, numbered_scene, world_scene
 from tests.sim_core.parity import Parity, compare, total
 from tests.sim_core.precision import drifts, one_step_difference
+from tests.sim_core.segregation import mean_goal_distance_m, segregated_fraction
 
 WHOLE_STEPS = 500
 WATCHED_STEPS = tuple(range(50, WHOLE_STEPS + 1, 50))

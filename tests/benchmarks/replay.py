@@ -65,7 +65,7 @@ def shoal_rival(prioritised: bool) -> Rival:
         if reply.draws is None:
             return None
         importance_weights(reply.draws.probability, BATCH, BETA)
-        return reply.draws.number, errors_of(count)
+        return reply.draws.insertion_index, errors_of(count)
 
     def answer(drawn) -> None:
         shard.set_priorities(*drawn)

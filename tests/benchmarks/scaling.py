@@ -11,7 +11,7 @@ from rich.table import Table
 
 from actors.rollout.vector_env import env_shape
 from actors.service.messages import transition_dtype
-from actors.service.packing import frames_of, packed_dtype
+from actors.service.packing import estimate_frames, packed_dtype
 from learner.config import RunConfig
 from learner.training.cluster import learner_settings
 from learner.update.learner import Learner
@@ -139,7 +139,7 @@ def work_of(config: RunConfig) -> Work:
     shape = env_shape(config.env)
     arrays = Learner(learner_settings(config, shape)).weights(0.0).arrays
     row = transition_dtype(shape.observation_space)
-    frames = frames_of(config.block_env_steps, config.steps_per_block, config.n_step)
+    frames = estimate_frames(config.block_env_steps, config.steps_per_block, config.n_step)
     packed = packed_dtype(row).itemsize + frames / config.block_env_steps * row["observation"].itemsize
     weights = sum(array.nbytes for array in arrays)
     sizes = (config.batch_size, config.updates_per_call)

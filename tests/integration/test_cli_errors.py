@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from actors.storage.part_writer import file_sum
+from actors.storage.fragment_writer import file_sum
 from deploy.cli import main, parse
 from learner.checkpoints.manifest import decode_manifest, encode_manifest
 from learner.presets import preset_config

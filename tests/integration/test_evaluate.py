@@ -64,7 +64,7 @@ def test_a_baseline_is_stored_as_it_was_played(capsys, folder, baseline, method)
     stored = load_evaluation(folder / "new" / "e.zarr")
     spec = EnvSpec(ENV_ID, WorldConfig(method=method, robots=4, groups=1))
     seeds = list(range(FIRST_SEED, FIRST_SEED + 5))
-    assert (stored.spec, stored.player, stored.updates) == (spec, str(baseline), 0)
+    assert (stored.spec, stored.candidate, stored.updates) == (spec, str(baseline), 0)
     assert stored.seed.tolist() == seeds
     assert_same_stats(stored.stats, evaluate(spec, baseline, seeds))
 
@@ -87,7 +87,7 @@ def test_a_policy_is_stored_as_it_was_played_on_another_setup(capsys, folder):
     assert "sensor 4r×2g: 5 greedy episodes" in capsys.readouterr().out
     stored = load_evaluation(folder / "e.zarr")
     spec = config.env._replace(world=dataclasses.replace(config.world, robots=4))
-    assert (stored.spec, stored.player, stored.updates) == (spec, "r", 77)
+    assert (stored.spec, stored.candidate, stored.updates) == (spec, "r", 77)
     assert_same_stats(stored.stats, evaluate(spec, weights, list(range(9, 14))))
 
 

@@ -53,7 +53,7 @@ def test_a_checkpoint_waits_for_one_call_of_each_part(small_run, tmp_path, monke
             loop._saver._checkpointer._thread.join()  # so that every checkpoint that is due is begun
 
     def most():
-        calls = Counter(pending.part for pending in loop._under_way._calls.values())
+        calls = Counter(pending.component for pending in loop._under_way._calls.values())
         return max(calls.values(), default=0)
 
     with closing(Journal(tmp_path / "m.jsonl", 0)) as journal:

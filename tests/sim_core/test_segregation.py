@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim_core.segregation import mean_goal_distance_m, mean_pairwise_distances_m, segregated_fraction
+from tests.sim_core.segregation import mean_goal_distance_m, mean_pairwise_distances_m, segregated_fraction
 
 
 def naive_mean_distance(first, second):

@@ -1,4 +1,4 @@
-"""Stored evaluations: round trip, readable by zarr alone, and never read back damaged."""
+"""Stored evaluations: round trip, readable with zarr alone, and damage is detected."""
 
 import json
 
@@ -10,7 +10,7 @@ from actors.evaluation import evaluation_store
 from actors.evaluation.evaluation_store import StoredEvaluation, load_evaluation, save_evaluation
 from actors.rollout.vector_env import EnvSpec
 from actors.service.messages import EpisodeStats
-from actors.storage import zarr_columns as storage
+from actors.storage import zarr_columns
 from sim_core import ENV_ID
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
@@ -22,7 +22,7 @@ def make_evaluation(episodes=50, seed=0):
     rng = np.random.default_rng(seed)
     return StoredEvaluation(
         spec=EnvSpec(ENV_ID, WorldConfig(robots=3, groups=4, method="out", apf_gain_m4_s=0.1 + 0.2)),
-        player="a run ×",
+        candidate="a run ×",
         updates=123_456,
         seed=2_000_000_000 + np.arange(episodes),
         stats=EpisodeStats(
@@ -40,8 +40,8 @@ def path(tmp_path):
 
 @pytest.fixture
 def saved(path, monkeypatch):
-    """A stored evaluation of several chunks a column."""
-    monkeypatch.setattr(storage, "CHUNK_ROWS", 20)
+    """A stored evaluation with several chunks per column."""
+    monkeypatch.setattr(zarr_columns, "CHUNK_ROWS", 20)
     save_evaluation(path, make_evaluation())
     return path
 
@@ -73,13 +73,13 @@ def test_zarr_alone_reads_the_columns(saved):
     assert root.attrs["header"]["world"]["groups"] == 4
 
 
-def test_an_older_one_is_not_overwritten(saved):
+def test_an_existing_evaluation_is_not_overwritten(saved):
     with pytest.raises(ConfigError, match=r"e\.zarr exists and is not overwritten"):
         save_evaluation(saved, make_evaluation(7, seed=1))
     assert_same(load_evaluation(saved), make_evaluation())
 
 
-def test_what_a_killed_save_left_is_no_evaluation_and_no_obstacle(path, monkeypatch):
+def test_the_remains_of_a_killed_save_are_no_evaluation_and_do_not_block_the_next_save(path, monkeypatch):
     def killed(*_):
         raise KeyboardInterrupt
 
@@ -93,7 +93,7 @@ def test_what_a_killed_save_left_is_no_evaluation_and_no_obstacle(path, monkeypa
     assert_same(load_evaluation(path), make_evaluation())
 
 
-def test_a_flipped_byte_in_any_chunk_is_noticed(saved):
+def test_a_flipped_bit_in_any_chunk_is_detected(saved):
     files = chunk_files(saved)
     assert len(files) == 12  # three chunks in each of four columns
     for i, file in enumerate(files):
@@ -107,14 +107,14 @@ def test_a_flipped_byte_in_any_chunk_is_noticed(saved):
     assert_same(load_evaluation(saved), make_evaluation())
 
 
-def test_a_missing_chunk_is_noticed_although_zarr_reads_zeros(saved):
+def test_a_missing_chunk_is_detected_although_zarr_reads_zeros(saved):
     chunk_files(saved)[-1].unlink()
     with pytest.raises(ValueError, match="column seed .* is damaged"):
         load_evaluation(saved)
 
 
 @pytest.mark.parametrize("column", COLUMNS)
-def test_a_missing_column_is_noticed(saved, column):
+def test_a_missing_column_is_detected(saved, column):
     (saved / column / "zarr.json").unlink()
     with pytest.raises(ValueError, match="incomplete"):
         load_evaluation(saved)
@@ -136,14 +136,14 @@ def change_header(path, change):
         lambda attributes: attributes.pop("header_crc32"),
     ],
 )
-def test_a_changed_header_is_noticed(saved, change):
+def test_a_changed_header_is_detected(saved, change):
     change_header(saved, change)
     with pytest.raises(ValueError, match="header of .* is damaged"):
         load_evaluation(saved)
 
 
 @pytest.mark.parametrize("settings", [{"a_setting_of_tomorrow": 1}, {"robots": 1}])
-def test_another_versions_settings_are_refused(saved, settings):
+def test_settings_of_another_version_are_refused(saved, settings):
     def change(attributes):
         attributes["header"]["world"].update(settings)
         attributes["header_crc32"] = evaluation_store._crc32(attributes["header"])
@@ -153,9 +153,9 @@ def test_another_versions_settings_are_refused(saved, settings):
         load_evaluation(saved)
 
 
-def test_what_is_no_evaluation_is_refused(path):
+def test_anything_but_an_evaluation_is_refused(path):
     with pytest.raises(ValueError, match="missing"):
         load_evaluation(path)
-    storage.save_rows(path, np.zeros(3, evaluation_store.EPISODE))
+    zarr_columns.save_rows(path, np.zeros(3, evaluation_store.EPISODE_DTYPE))
     with pytest.raises(ValueError, match="format"):
         load_evaluation(path)

@@ -1,4 +1,4 @@
-"""Evaluation: one episode a seed, against one environment stepped in a plain loop."""
+"""Evaluation: one episode per seed, compared with a single environment in a plain loop."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from actors.evaluation import evaluator
-from actors.evaluation.evaluator import evaluate, evaluate_in_parts, record_episode, record_frames
+from actors.evaluation.evaluator import evaluate, evaluate_in_parallel, record_episode, record_frames
 from actors.policy.baselines import Baseline
 from actors.policy.network import Policy
 from actors.rollout.vector_env import EnvSpec
@@ -34,20 +34,20 @@ def play(env, policy, seed):
 
 
 @pytest.mark.parametrize("name", ["swarm", "cart_pole"])
-def test_equals_single_episodes(name, request, make_weights):
+def test_an_evaluation_equals_single_episodes(name, request, make_weights):
     spec = request.getfixturevalue(name)
     weights = make_weights(spec, seed=3)
-    env = SwarmEnv(**vars(spec.world)) if spec.is_swarm else gym.make(spec.env_id)
+    env = SwarmEnv(**spec.settings) if spec.is_swarm else gym.make(spec.env_id)
     expected = [play(env, Policy(weights), seed) for seed in SEEDS]
     stats = evaluate(spec, weights, SEEDS)
     assert list(zip(stats.outcome, stats.length_steps, strict=True)) == [row[:2] for row in expected]
     np.testing.assert_allclose(stats.episode_return, [row[2] for row in expected], rtol=1e-9)
-    assert len(set(stats.length_steps)) > 1  # or short episodes could not be over-counted
+    assert len(set(stats.length_steps)) > 1  # otherwise short episodes could not be over-represented
     env.close()
 
 
 @pytest.mark.parametrize("chunk", [1, 2, 3, 7])
-def test_does_not_depend_on_how_many_play_at_once(monkeypatch, swarm, make_weights, chunk):
+def test_an_evaluation_does_not_depend_on_the_number_of_environments(monkeypatch, swarm, make_weights, chunk):
     weights = make_weights(swarm)
     expected = evaluate(swarm, weights, SEEDS)
     monkeypatch.setattr(evaluator, "MAX_ENVS", chunk)
@@ -63,28 +63,28 @@ def test_entries_are_in_the_order_of_the_seeds(swarm, make_weights):
     assert [len(column) for column in evaluate(swarm, weights, [])] == [0, 0, 0]
 
 
-@pytest.mark.parametrize("parts", [1, 2, 3, 5, 7, 20])
+@pytest.mark.parametrize("max_calls", [1, 2, 3, 5, 7, 20])
 @pytest.mark.parametrize("name", ["learned", *Baseline])
-def test_parts_give_the_whole_in_the_order_of_the_seeds(swarm, make_weights, name, parts):
+def test_a_parallel_evaluation_equals_the_whole_in_the_order_of_the_seeds(swarm, make_weights, name, max_calls):
     spec = swarm._replace(world=dataclasses.replace(swarm.world, horizon_steps=100))
     candidate = make_weights(spec) if name == "learned" else Baseline(name)
     calls = LocalCalls()
     seeds = SEEDS[::-1]
     whole = evaluate(spec, candidate, seeds)
-    joined = evaluate_in_parts(calls, spec, calls.put(candidate), seeds, parts)
+    joined = evaluate_in_parallel(calls, spec, calls.put(candidate), seeds, max_calls)
     for first, second in zip(joined, whole, strict=True):
         np.testing.assert_array_equal(first, second)
-    assert len(set(whole.length_steps)) > 3  # or their order would not show
+    assert len(set(whole.length_steps)) > 3  # otherwise a wrong order would not show
 
 
-def test_no_seeds_in_parts(swarm):
+def test_a_parallel_evaluation_of_no_seeds_is_empty(swarm):
     calls = LocalCalls()
-    none = evaluate_in_parts(calls, swarm, calls.put(Baseline.RANDOM), [], 4)
+    none = evaluate_in_parallel(calls, swarm, calls.put(Baseline.RANDOM), [], 4)
     assert [len(column) for column in none] == [0, 0, 0]
 
 
 @pytest.mark.parametrize("method", ["sensor", "in", "out"])
-def test_fl_orca_is_the_swarm_without_an_action(method):
+def test_the_fl_orca_baseline_steps_the_swarm_without_an_action(method):
     world = WorldConfig(method=method, robots=4, groups=2, arena_radius_m=2.0, horizon_steps=300)
     stats = evaluate(EnvSpec(ENV_ID, world), Baseline.FL_ORCA, SEEDS)
     for i, seed in enumerate(SEEDS):
@@ -101,7 +101,7 @@ def test_fl_orca_is_the_swarm_without_an_action(method):
 
 @pytest.mark.parametrize("baseline", Baseline)
 @pytest.mark.parametrize("chunk", [1, 3])
-def test_a_baseline_does_not_depend_on_how_many_play_at_once(monkeypatch, swarm, baseline, chunk):
+def test_a_baseline_does_not_depend_on_the_number_of_environments(monkeypatch, swarm, baseline, chunk):
     expected = evaluate(swarm, baseline, SEEDS)
     monkeypatch.setattr(evaluator, "MAX_ENVS", chunk)
     for first, second in zip(evaluate(swarm, baseline, SEEDS), expected, strict=True):
@@ -109,7 +109,7 @@ def test_a_baseline_does_not_depend_on_how_many_play_at_once(monkeypatch, swarm,
 
 
 @pytest.mark.parametrize("baseline", Baseline)
-def test_a_recorded_baseline_is_the_evaluated_one(swarm, baseline):
+def test_a_recorded_baseline_equals_the_evaluated_one(swarm, baseline):
     stats = evaluate(swarm, baseline, SEEDS)
     for i, seed in enumerate(SEEDS):
         episode = record_episode(swarm, baseline, seed)
@@ -117,12 +117,12 @@ def test_a_recorded_baseline_is_the_evaluated_one(swarm, baseline):
         assert ((episode.action[:-1] == -1) == (baseline is Baseline.FL_ORCA)).all()
 
 
-def test_a_baseline_in_an_environment_that_is_not_ours_is_refused(cart_pole):
-    with pytest.raises(ConfigError, match="random plays in our own environment only, not in CartPole-v1"):
+def test_a_baseline_in_another_environment_is_refused(cart_pole):
+    with pytest.raises(ConfigError, match="random plays in the swarm environment only, not in CartPole-v1"):
         evaluate(cart_pole, Baseline.RANDOM, SEEDS)
 
 
-def test_a_recorded_episode_is_the_evaluated_one(swarm, make_weights):
+def test_a_recorded_episode_equals_the_evaluated_one(swarm, make_weights):
     weights = make_weights(swarm, seed=5)
     stats = evaluate(swarm, weights, SEEDS)
     for i, seed in enumerate(SEEDS):
@@ -133,9 +133,9 @@ def test_a_recorded_episode_is_the_evaluated_one(swarm, make_weights):
         assert episode.action[-1] == -1 and episode.reward[-1] == 0 and (episode.action[:-1] >= 0).all()
 
 
-def test_a_recorded_episode_holds_what_happened(swarm, make_weights):
+def test_a_recorded_episode_holds_every_state(swarm, make_weights):
     episode = record_episode(swarm, make_weights(swarm), SEEDS[0])
-    worlds = SwarmEnv(**vars(swarm.world))
+    worlds = SwarmEnv(**swarm.settings)
     worlds.reset(seed=SEEDS[0])
     for t, action in enumerate(episode.action):
         np.testing.assert_array_equal(episode.position[t], worlds.worlds.positions()[0])
@@ -151,7 +151,7 @@ def test_a_recorded_episode_holds_what_happened(swarm, make_weights):
     assert 0 <= episode.learner < swarm.world.num_robots
 
 
-def test_frames_of_an_environment_without_images(monkeypatch, cart_pole, make_weights):
+def test_an_environment_without_images_gives_no_frames(monkeypatch, cart_pole, make_weights):
     def no_images(env_id, render_mode):
         raise gym.error.UnsupportedMode(render_mode)
 
@@ -160,11 +160,11 @@ def test_frames_of_an_environment_without_images(monkeypatch, cart_pole, make_we
 
 
 @pytest.mark.parametrize(("name", "rate"), [("cart_pole", 50), ("swarm", 20)])
-def test_frames_have_one_image_a_step(name, rate, request, make_weights):
+def test_recorded_frames_have_one_image_per_step(name, rate, request, make_weights):
     spec = request.getfixturevalue(name)
     weights = make_weights(spec)
     frames, frames_per_s = record_frames(spec, weights, 4)
-    if not spec.is_swarm:  # gym.make knows nothing of the spec's world
+    if not spec.is_swarm:  # gym.make ignores the spec's world
         assert len(frames) == evaluate(spec, weights, [4]).length_steps[0]
     assert frames_per_s == rate
     assert frames[0].dtype == np.uint8 and frames[0].ndim == 3

@@ -1,4 +1,4 @@
-"""The table of a sweep's results: written whole, read back as it was, refused where its counts cannot be."""
+"""The table of a sweep's results: round trip, and refusal of impossible counts."""
 
 import pytest
 
@@ -10,7 +10,7 @@ ROW = ResultRow("thesis", "learned", "out", 5, 2, 1, 10, 2, 10, 4, 3, 2, 1, 0, 1
 FIXED = ROW._replace(robots=5, seed=0)
 
 
-def test_what_is_written_is_read_in_a_fixed_order(tmp_path):
+def test_rows_are_written_in_a_fixed_order_and_read_back(tmp_path):
     path = tmp_path / "new" / "results.csv"
     write_table(path, [ROW, FIXED])
     again = tmp_path / "again.csv"
@@ -20,12 +20,12 @@ def test_what_is_written_is_read_in_a_fixed_order(tmp_path):
     assert [file.name for file in path.parent.iterdir()] == ["results.csv"]
 
 
-def test_an_empty_table_is_a_table(tmp_path):
+def test_an_empty_table_can_be_read(tmp_path):
     write_table(tmp_path / "results.csv", [])
     assert read_table(tmp_path / "results.csv") == []
 
 
-def test_counts_go_by_outcome():
+def test_counts_by_outcome():
     assert [ROW.count(kind) for kind in ENDED] == [4, 3, 2, 1, 0]
     assert ROW.count(Outcome.CAPTURED) == 2
     assert FIXED.is_fixed and not ROW.is_fixed and not FIXED._replace(groups=3).is_fixed
@@ -41,7 +41,7 @@ def test_counts_go_by_outcome():
         ("goal,lost -> lost,goal", "first line"),
     ],
 )
-def test_a_table_that_cannot_be_is_refused(tmp_path, change, words):
+def test_a_table_with_impossible_counts_or_columns_is_refused(tmp_path, change, words):
     path = tmp_path / "results.csv"
     write_table(path, [ROW])
     before, after = change.split(" -> ")
@@ -53,7 +53,7 @@ def test_a_table_that_cannot_be_is_refused(tmp_path, change, words):
 
 
 @pytest.mark.parametrize("content", [None, b"", b"\xff\xfe\x00", b"what,else\n1,2\n"])
-def test_what_is_no_table_is_refused(tmp_path, content):
+def test_anything_but_a_table_is_refused(tmp_path, content):
     path = tmp_path / "results.csv"
     if content is not None:
         path.write_bytes(content)

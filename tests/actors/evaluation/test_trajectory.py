@@ -1,4 +1,4 @@
-"""Recorded episodes: round trip, a layout that zarr alone reads, and refusals."""
+"""Recorded episodes: round trip, a layout that zarr alone can read, and refusals."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def test_the_layout_is_that_of_diffusion_policy(path):
     np.testing.assert_array_equal(root["data/position"][5:7], episodes[1].position)
 
 
-def test_saving_again_replaces_and_leaves_nothing_else(path):
+def test_saving_again_replaces_the_older_episodes(path):
     save_episodes(path, [make_episode(5, 0)], CONFIG)
     save_episodes(path, [make_episode(3, 4)], CONFIG)
     loaded, _ = load_episodes(path)
@@ -63,7 +63,7 @@ def test_saving_again_replaces_and_leaves_nothing_else(path):
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
-def test_a_failed_save_leaves_the_older_one(path):
+def test_a_failed_save_leaves_the_older_episodes(path):
     save_episodes(path, [make_episode(5, 0)], CONFIG)
     odd = make_episode(3, 1)._replace(goal=np.zeros((3, 2), np.float32))
     with pytest.raises(ValueError):
@@ -73,7 +73,7 @@ def test_a_failed_save_leaves_the_older_one(path):
         save_episodes(path, [], CONFIG)
 
 
-def test_what_holds_no_episodes_is_refused(path):
+def test_anything_but_recorded_episodes_is_refused(path):
     with pytest.raises(ValueError, match="shoal watch"):
         load_episodes(path)
     zarr.open_group(str(path), mode="w").attrs["format"] = "shoal-trajectories-0"

@@ -1,4 +1,4 @@
-"""The policy in numpy against the network in torch."""
+"""The compiled policy against the network in torch."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def observations(shape, dtype, seed=0, batch=7):
     kind=st.sampled_from(["plain", "dueling"]),
 )
 @settings(max_examples=80, deadline=None)
-def test_policy_computes_what_the_network_computes(shape, dtype, hidden_sizes, num_actions, seed, kind):
+def test_the_policy_computes_the_same_values_as_the_network(shape, dtype, hidden_sizes, num_actions, seed, kind):
     network = make_network(int(np.prod(shape)), hidden_sizes, num_actions, seed, kind)
     observation = observations(shape, dtype, seed)
     policy = Policy(snapshot(network, 0, 0.0))
@@ -41,15 +41,15 @@ def test_policy_computes_what_the_network_computes(shape, dtype, hidden_sizes, n
     np.testing.assert_array_equal(policy.greedy(observation), values.argmax(axis=1))
 
 
-def test_relu_stands_between_layers_and_not_after_the_last():
+def test_relu_follows_every_layer_but_the_last():
     identity = np.eye(2, dtype=np.float32)
     zero, one = np.zeros(2, np.float32), np.ones(2, np.float32)
     policy = Policy(WeightsSnapshot(0, 0.0, (identity, zero, -identity, -one)))
-    # relu([3, -4]) = [3, 0]; a ReLU at the end would give zeros, none at all [-4, 3].
+    # relu([3, -4]) = [3, 0]. A ReLU after the last layer would give zeros, no ReLU at all [-4, 3].
     np.testing.assert_array_equal(policy.values(np.array([[3.0, -4.0]])), [[-4.0, -1.0]])
 
 
-def test_values_stay_what_they_were_when_the_policy_acts_again():
+def test_returned_values_are_copies():
     policy = Policy(snapshot(make_network(4, (6, 5), 3), 0, 0.0))
     first = policy.values(observations((4,), np.float32, seed=1))
     kept = first.copy()
@@ -58,7 +58,7 @@ def test_values_stay_what_they_were_when_the_policy_acts_again():
     np.testing.assert_array_equal(first, kept)
 
 
-def test_a_network_that_has_come_to_nan_says_so():
+def test_nan_weights_give_nan_values():
     nan = np.full((2, 1), np.nan, np.float32)
     zero = np.zeros(2, np.float32)
     assert np.isnan(
@@ -66,14 +66,14 @@ def test_a_network_that_has_come_to_nan_says_so():
     ).all()
 
 
-def test_ties_go_to_the_lowest_index():
+def test_ties_are_broken_by_the_lowest_index():
     zeros = (np.zeros((3, 2), np.float32), np.zeros(3, np.float32))
     output = (np.zeros((4, 3), np.float32), np.array([1, 2, 2, 0], np.float32))
     np.testing.assert_array_equal(Policy(WeightsSnapshot(0, 0.0, zeros + output)).greedy(np.zeros((3, 2))), [1, 1, 1])
 
 
 def streams(network, observation):
-    """V(s) and A(s, a) of a dueling network, loop by loop from its parameters."""
+    """V(s) and A(s, a) of a dueling network, computed layer by layer from its parameters."""
     parameters = {name: tensor.detach().numpy().astype(float) for name, tensor in network.named_parameters()}
     x = observation.astype(float)
     for i in range(0, len(network.layers), 2):
@@ -87,8 +87,8 @@ def streams(network, observation):
 
 
 @pytest.mark.parametrize("hidden_sizes", [(5,), (7, 6), (8, 7, 5)])
-def test_a_dueling_network_is_equation_9(hidden_sizes):
-    """Q = V + A - mean A: the mean over actions is the state's value, however the advantages are shifted."""
+def test_a_dueling_network_computes_equation_9(hidden_sizes):
+    """Q = V + A - mean A: the mean over actions is V, and a constant added to all advantages changes nothing."""
     network, observation = make_network(4, hidden_sizes, 3, kind="dueling"), observations((4,), np.float32)
     value, advantage = streams(network, observation)
     assert value.shape == (7, 1) and advantage.shape == (7, 3)
@@ -100,20 +100,20 @@ def test_a_dueling_network_is_equation_9(hidden_sizes):
         torch.testing.assert_close(network(torch.from_numpy(observation)), values, rtol=1e-4, atol=1e-5)
 
 
-def test_a_dueling_network_has_a_stream_each_of_the_last_hidden_width():
+def test_each_stream_of_a_dueling_network_has_the_last_hidden_width():
     shapes = [tuple(parameter.shape) for parameter in DuelingNetwork(4, (8, 5), 3).parameters()]
     assert shapes == [(8, 4), (8,), (10, 8), (10,), (1, 5), (1,), (3, 5), (3,)]
     arrays = snapshot(DuelingNetwork(4, (8, 5), 3), 0, 0.0).arrays
     assert [array.shape for array in arrays] == [tuple(p.shape) for p in QNetwork(4, (8, 10), 3).parameters()]
 
 
-def test_snapshot_round_trip_and_copies():
+def test_snapshots_round_trip_and_are_copies():
     network = make_network(6, (5, 4), 3)
     weights = snapshot(network, 17, 4.5)
     assert (weights.version, weights.time_s) == (17, 4.5)
     other = make_network(6, (5, 4), 3, seed=9)
     for array in weights.arrays:
-        array.flags.writeable = False  # as Ray gives them
+        array.flags.writeable = False  # like arrays from Ray
     load_snapshot(other, weights)
     again = snapshot(other, 17, 4.5)
     for first, second in zip(weights.arrays, again.arrays, strict=True):

@@ -1,4 +1,4 @@
-"""The sum tree against numpy's cumulated sums."""
+"""The sum tree against numpy's cumulative sums."""
 
 import math
 
@@ -20,11 +20,11 @@ def tree_of(values):
 
 
 def masses(uniform, strata, total):
-    """Where each draw looks: parts of `strata` draws, a draw in each of as many equal pieces."""
+    """Position of each draw in the total: batches of `strata` draws, one draw in each of as many equal ranges."""
     found = []
     for start in range(0, len(uniform), strata):
-        part = uniform[start : start + strata]
-        found += [(i + u) / len(part) * total for i, u in enumerate(part)]
+        batch = uniform[start : start + strata]
+        found += [(i + u) / len(batch) * total for i, u in enumerate(batch)]
     return np.array(found)
 
 
@@ -35,10 +35,10 @@ def masses(uniform, strata, total):
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=200, deadline=None)
-def test_finds_what_a_search_in_the_cumulated_sums_finds(values, count, strata, seed):
-    """Whole numbers have exact sums, so the slots must be the same."""
+def test_samples_equal_a_search_in_the_cumulative_sums(values, count, strata, seed):
+    """Integers have exact sums, so the slots must be identical."""
     uniform = np.random.default_rng(seed).random(count)
-    slots, found = tree_of(values).find(uniform, strata)
+    slots, found = tree_of(values).stratified_sample(uniform, strata)
     expected = np.searchsorted(np.cumsum(values), masses(uniform, strata, sum(values)), side="right")
     np.testing.assert_array_equal(slots, expected)
     np.testing.assert_array_equal(found, np.asarray(values, float)[expected])
@@ -49,8 +49,8 @@ def test_finds_what_a_search_in_the_cumulated_sums_finds(values, count, strata, 
     uniform=st.lists(st.sampled_from([0.0, 5e-324, 0.1, 0.5, ALMOST_1]), min_size=1, max_size=20),
 )
 @settings(max_examples=200, deadline=None)
-def test_rounding_leads_to_no_zero_and_not_far(values, uniform):
-    slots, found = tree_of(values).find(np.array(uniform), len(uniform))
+def test_rounding_errors_reach_no_zero_and_stay_small(values, uniform):
+    slots, found = tree_of(values).stratified_sample(np.array(uniform), len(uniform))
     assert (found > 0).all()
     ends = np.cumsum(values)
     wanted, slack = masses(uniform, len(uniform), ends[-1]), 1e-13 * ends[-1]
@@ -59,18 +59,18 @@ def test_rounding_leads_to_no_zero_and_not_far(values, uniform):
 
 @st.composite
 def changes(draw):
-    """A capacity and changes of its numbers."""
+    """A capacity and changes of values."""
     capacity = draw(st.integers(1, 33))
-    number = st.floats(0, 1e6, allow_nan=False)
+    value = st.floats(0, 1e6, allow_nan=False)
     slot = st.integers(0, capacity - 1)
-    fills = st.tuples(slot, st.integers(0, capacity), number)
-    puts = st.lists(st.tuples(slot, number), max_size=12)
-    return capacity, draw(st.lists(fills | puts, max_size=8))
+    fills = st.tuples(slot, st.integers(0, capacity), value)
+    sets = st.lists(st.tuples(slot, value), max_size=12)
+    return capacity, draw(st.lists(fills | sets, max_size=8))
 
 
 @given(changes())
 @settings(max_examples=150, deadline=None)
-def test_changes_leave_the_tree_that_the_numbers_alone_make(case):
+def test_the_leaves_alone_determine_the_tree(case):
     capacity, steps = case
     tree, expected = SumTree(capacity), np.zeros(capacity)
     for step in steps:
@@ -80,7 +80,7 @@ def test_changes_leave_the_tree_that_the_numbers_alone_make(case):
             tree.fill(start, count, value)
             expected[start : start + count] = value
         else:
-            tree.put(np.array([slot for slot, _ in step], np.int64), np.array([value for _, value in step]))
+            tree.set(np.array([slot for slot, _ in step], np.int64), np.array([value for _, value in step]))
             for slot, value in step:
                 expected[slot] = value
     np.testing.assert_array_equal(tree.values, expected)
@@ -94,21 +94,21 @@ def test_sums_do_not_drift():
     tree.fill(0, 1000, 1e8)
     for _ in range(300):
         slots = rng.integers(1000, size=400)
-        tree.put(slots, rng.choice([1e-6, 1e8], size=400))
+        tree.set(slots, rng.choice([1e-6, 1e8], size=400))
     tree.fill(0, 1000, 1e-6)
     assert tree.total == pytest.approx(1e-3, rel=1e-13)
 
 
-def test_shorter_numbers_leave_zeros_behind_them():
+def test_loading_fewer_values_sets_the_others_to_zero():
     tree = tree_of([1.0, 2.0, 3.0])
     tree.load(np.array([5.0]))
     assert tree.values.tolist() == [5.0, 0.0, 0.0] and tree.total == 5.0
 
 
 @pytest.mark.parametrize("strata", [1, 64, 100_000])
-def test_numbers_are_drawn_in_proportion(strata):
+def test_slots_are_drawn_in_proportion_to_their_values(strata):
     values = np.random.default_rng(1).choice([0.0, 0.1, 1.0, 3.0], size=100)
-    slots, _ = tree_of(values).find(np.random.default_rng(2).random(100_000), strata)
+    slots, _ = tree_of(values).stratified_sample(np.random.default_rng(2).random(100_000), strata)
     counts, positive = np.bincount(slots, minlength=100), values > 0
     assert not counts[~positive].any()
     expected = 100_000 * values / values.sum()
@@ -117,6 +117,6 @@ def test_numbers_are_drawn_in_proportion(strata):
     assert (np.abs(counts - expected) <= 5 * np.sqrt(expected) + 1).all()
 
 
-def test_a_part_takes_one_draw_from_each_piece():
-    slots, _ = tree_of(np.full(16, 0.25)).find(np.random.default_rng(3).random(16 * 5), 16)
+def test_a_batch_takes_one_draw_from_each_stratum():
+    slots, _ = tree_of(np.full(16, 0.25)).stratified_sample(np.random.default_rng(3).random(16 * 5), 16)
     np.testing.assert_array_equal(slots.reshape(5, 16), np.tile(np.arange(16), (5, 1)))

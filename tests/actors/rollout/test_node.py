@@ -235,7 +235,7 @@ def test_a_push_that_is_tried_again_is_stored_and_reported_once(make_node, make_
     node = make_node([shard], Unreliable(*[(Fault.UNREACHABLE, made)] * times))
     (report,) = node.collect(0.5)
     assert (report.stored, report.rows, report.dropped, report.fault) == (BLOCK, BLOCK, None, None)
-    assert (shard.size(), shard.shard.dropped) == (BLOCK, times * BLOCK * made)
+    assert (shard.size(), shard.shard.get_state()["dropped"]) == (BLOCK, times * BLOCK * made)
 
 
 @pytest.mark.parametrize("fault", [Fault.DIED, Fault.LATE])

@@ -1,4 +1,4 @@
-"""n-step transitions against a reference that looks at whole episodes of one environment."""
+"""n-step transitions against a reference that sees whole episodes of one environment."""
 
 import gymnasium as gym
 import numpy as np
@@ -18,14 +18,14 @@ DISCOUNT = 0.9
 
 
 def reference(rewards, ends, n_step):
-    """Rows (start, action, return, discount, state reached) of one environment, oldest first."""
+    """Rows (start, action, return, discount, next state) of one environment, oldest first."""
     rows, start = [], 0
     for stop in [*np.flatnonzero(ends) + 1, len(ends)]:
         ended = stop > start and ends[stop - 1] != RUNS
         for t in range(start, stop):
             last = min(t + n_step, stop)
             if last - t < n_step and not ended:
-                continue  # still waits for rewards
+                continue  # pending: rewards are missing
             value = sum(DISCOUNT**k * rewards[t + k] for k in range(last - t))
             terminal = last == stop and ends[stop - 1] == TERMINATES
             rows.append((t, t % 7, value, 0.0 if terminal else DISCOUNT ** (last - t), last))
@@ -34,7 +34,7 @@ def reference(rewards, ends, n_step):
 
 
 def steps_of(rewards, ends, steps):
-    """Env steps `steps` of `rewards`, `ends` `[steps, num_envs]`; an observation tells environment and step."""
+    """Env steps `steps` of `rewards` and `ends` `[steps, num_envs]`; an observation is (environment, step)."""
     env, t = np.meshgrid(np.arange(rewards.shape[1]), list(steps))
     seen = np.stack([env, t], axis=-1).astype(np.float32)
     chosen = ends[list(steps)]
@@ -42,13 +42,13 @@ def steps_of(rewards, ends, steps):
 
 
 def push_all(assembler, rewards, ends, steps, cuts=()):
-    """Pushes env steps in blocks that are cut at `cuts`; all rows in the order they came."""
+    """Pushes env steps in blocks that are split at `cuts`; returns all rows in order."""
     parts = np.split(np.array(steps, np.int64), sorted({cut for cut in cuts if 0 < cut < len(steps)}))
     return np.concatenate([unpack(assembler.push(steps_of(rewards, ends, part)), DTYPE) for part in parts])
 
 
 def of_env(rows, env):
-    """Rows of one environment in order, as the reference lists them."""
+    """Rows of one environment in order, in the format of the reference."""
     mine = rows[rows["observation"][:, 0] == env]
     assert (mine["next_observation"][:, 0] == env).all()
     columns = (mine["observation"][:, 1], mine["action"], mine["reward"], mine["discount"])
@@ -66,7 +66,7 @@ def histories(draw):
 
 @given(history=histories(), n_step=st.integers(1, 5), cuts=st.sets(st.integers(1, 13)))
 @settings(max_examples=300, deadline=None)
-def test_equals_the_reference_per_environment_and_in_order(history, n_step, cuts):
+def test_transitions_equal_the_reference_per_environment_and_in_order(history, n_step, cuts):
     rewards, ends = history
     assembler = NStepAssembler(ROW, rewards.shape[1], n_step, DISCOUNT)
     rows = push_all(assembler, rewards, ends, range(len(rewards)), cuts)
@@ -78,15 +78,15 @@ def test_equals_the_reference_per_environment_and_in_order(history, n_step, cuts
 
 @given(history=histories(), n_step=st.integers(1, 5), data=st.data())
 @settings(max_examples=60, deadline=None)
-def test_a_saved_state_goes_on_where_it_was(history, n_step, data):
+def test_a_restored_assembler_continues_identically(history, n_step, data):
     rewards, ends = history
     cut = data.draw(st.integers(0, len(rewards)))
     whole = NStepAssembler(ROW, rewards.shape[1], n_step, DISCOUNT)
     push_all(whole, rewards, ends, range(cut))
     saved = whole.get_state()
     resumed = NStepAssembler(ROW, rewards.shape[1], n_step, DISCOUNT)
-    push_all(resumed, rewards + 5, ends, range(min(2, len(rewards))))  # what it held before must not matter
-    expected = push_all(whole, rewards, ends, range(cut, len(rewards)))  # must not change what was saved
+    push_all(resumed, rewards + 5, ends, range(min(2, len(rewards))))  # its previous content must not matter
+    expected = push_all(whole, rewards, ends, range(cut, len(rewards)))  # must not change the saved state
     resumed.set_state(saved)
     np.testing.assert_array_equal(push_all(resumed, rewards, ends, range(cut, len(rewards))), expected)
 
@@ -94,7 +94,7 @@ def test_a_saved_state_goes_on_where_it_was(history, n_step, data):
 @pytest.mark.parametrize(
     ("end", "discounts"), [(TERMINATES, [0, 0, 0]), (TRUNCATES, [0.9**3, 0.9**2, 0.9]), (RUNS, [0.9**3])]
 )
-def test_termination_counts_no_future_and_truncation_does(end, discounts):
+def test_termination_has_discount_0_and_truncation_keeps_it(end, discounts):
     rewards, ends = np.array([[1.0], [2.0], [4.0]]), np.array([[RUNS], [RUNS], [end]])
     rows = push_all(NStepAssembler(ROW, 1, 3, DISCOUNT), rewards, ends, range(3))
     np.testing.assert_allclose(rows["discount"], discounts, rtol=1e-6)
@@ -102,18 +102,9 @@ def test_termination_counts_no_future_and_truncation_does(end, discounts):
     np.testing.assert_allclose(rows["reward"], returns[: len(rows)], rtol=1e-6)
 
 
-def test_clear_forgets_waiting_steps():
-    rewards, ends = np.ones((4, 2)), np.zeros((4, 2), int)
-    assembler = NStepAssembler(ROW, 2, 3, DISCOUNT)
-    push_all(assembler, rewards, ends, range(2))
-    assembler.clear()
-    rows = push_all(assembler, rewards, ends, range(2, 4))
-    assert len(rows) == 0
-
-
 @given(history=histories(), n_step=st.integers(1, 5), cut=st.integers(0, 6))
 @settings(max_examples=100, deadline=None)
-def test_only_what_no_row_begins_with_is_kept_as_a_frame(history, n_step, cut):
+def test_only_next_observations_without_a_row_become_frames(history, n_step, cut):
     rewards, ends = history
     assembler = NStepAssembler(ROW, rewards.shape[1], n_step, DISCOUNT)
     for part in (range(cut), range(cut, len(rewards))):

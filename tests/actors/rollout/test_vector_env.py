@@ -1,4 +1,4 @@
-"""Vector environments: same-step restarts, the states that steps reach, and refusals."""
+"""Vector environments: same-step restarts, next observations, and refusals."""
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +14,7 @@ NUM_ENVS = 3
 
 
 class OddSpaces(gym.Env):
-    """An environment whose spaces the tests choose."""
+    """An environment with spaces that a test chooses."""
 
     def __init__(self, observation, action):
         self.observation_space, self.action_space = observation, action
@@ -26,7 +26,7 @@ class OddSpaces(gym.Env):
 
 @pytest.fixture
 def odd_id():
-    """Function: registers spaces under an id that is gone after the test."""
+    """Function: registers spaces under an id that is removed after the test."""
     env_id = "shoal-test/Odd-v0"
 
     def register(observation, action):
@@ -39,12 +39,12 @@ def odd_id():
 
 def single_envs(spec):
     if spec.is_swarm:
-        return [SwarmEnv(**vars(spec.world)) for _ in range(NUM_ENVS)]
+        return [SwarmEnv(**spec.settings) for _ in range(NUM_ENVS)]
     return [gym.make(spec.env_id) for _ in range(NUM_ENVS)]
 
 
 @pytest.mark.parametrize("name", ["swarm", "cart_pole"])
-def test_steps_reach_what_single_environments_reach(name, request):
+def test_next_observations_equal_those_of_single_environments(name, request):
     spec = request.getfixturevalue(name)
     env, singles, seeds = make_vector_env(spec, NUM_ENVS), single_envs(spec), [11, 5, 7]
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
@@ -69,12 +69,12 @@ def test_steps_reach_what_single_environments_reach(name, request):
     env.close()
 
 
-def test_without_an_end_the_states_reached_are_the_observations(swarm):
+def test_without_an_ended_episode_next_observations_are_the_observations(swarm):
     observation = np.zeros((2, 3))
     assert final_observations(observation, np.zeros(2, np.bool_), {}) is observation
 
 
-def test_the_makers_and_shapes(swarm, cart_pole):
+def test_environments_and_their_shapes(swarm, cart_pole):
     assert isinstance(make_vector_env(swarm, 2).unwrapped, SwarmVectorEnv)
     assert env_shape(swarm).observation_size == 2 * swarm.world.sectors
     assert env_shape(swarm).num_actions == swarm.world.num_actions

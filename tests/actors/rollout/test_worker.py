@@ -1,4 +1,4 @@
-"""A rollout worker against environments that are stepped by hand with the same actions."""
+"""A rollout worker against environments that the test steps with the same actions."""
 
 import json
 
@@ -17,7 +17,7 @@ NUM_ENVS, STEPS = 4, 20
 
 
 def transitions_of(spec, blocks):
-    """Whole transitions of all blocks."""
+    """Unpacked transitions of all blocks."""
     dtype = transition_dtype(env_shape(spec).observation_space)
     return np.concatenate([unpack(block.packed, dtype) for block in blocks])
 
@@ -37,7 +37,7 @@ def make_worker(make_weights):
 
 
 def assert_same_block(first, second):
-    assert first.header == second.header._replace(made=first.header.made)  # counted from the start of the process
+    assert first.header == second.header._replace(made=first.header.made)  # counts from the start of the process
     for a, b in zip(first.packed, second.packed, strict=True):
         np.testing.assert_array_equal(a, b)
     for a, b in zip(first.episodes, second.episodes, strict=True):
@@ -45,8 +45,8 @@ def assert_same_block(first, second):
 
 
 def by_hand(spec, worlds, rows):
-    """Steps worlds that start as `worlds` with the actions of `rows`; expected columns and ended episodes."""
-    env = SwarmVectorEnv(NUM_ENVS, **vars(spec.world))
+    """Steps worlds from the state `worlds` with the actions of `rows`; returns expected columns and ended episodes."""
+    env = SwarmVectorEnv(NUM_ENVS, **spec.settings)
     observation = env.worlds.set_state(worlds)
     columns, ended = [], []
     for step in rows.reshape(-1, NUM_ENVS):
@@ -61,7 +61,7 @@ def by_hand(spec, worlds, rows):
     return [np.concatenate(column) for column in zip(*columns, strict=True)], ended
 
 
-def test_transitions_and_episodes_are_those_of_the_environment(swarm, make_worker):
+def test_transitions_and_episodes_equal_those_of_the_environment(swarm, make_worker):
     worker = make_worker(swarm)
     arrays = worker.get_state()["arrays"]
     worlds = {name.removeprefix("world_"): array for name, array in arrays.items() if name.startswith("world_")}
@@ -78,14 +78,14 @@ def test_transitions_and_episodes_are_those_of_the_environment(swarm, make_worke
     np.testing.assert_allclose(stats.episode_return, episode_return, rtol=1e-6)
 
 
-def test_greedy_actions_are_the_policys(swarm, make_worker, make_weights):
+def test_greedy_actions_are_those_of_the_policy(swarm, make_worker, make_weights):
     rows = make_worker(swarm).collect(0.0).packed.rows
     policy = Policy(make_weights(swarm))
     np.testing.assert_array_equal(rows["action"], policy.greedy(rows["observation"]))
     assert len(set(rows["action"])) > 1
 
 
-def test_the_header_says_where_a_block_comes_from(swarm, make_worker, make_weights):
+def test_the_header_holds_the_origin_of_a_block(swarm, make_worker, make_weights):
     worker = make_worker(swarm)
     first, second = worker.collect(0.25).header, worker.collect(0.125).header
     expected = (SCHEMA_VERSION, 3, 1, 0, 12, 3.5, 0.25, NUM_ENVS * STEPS, NUM_ENVS * STEPS)
@@ -97,7 +97,7 @@ def test_the_header_says_where_a_block_comes_from(swarm, make_worker, make_weigh
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
-def test_a_saved_worker_makes_the_same_blocks(swarm, make_worker, n_step):
+def test_a_restored_worker_makes_the_same_blocks(swarm, make_worker, n_step):
     worker = make_worker(swarm, n_step)
     worker.collect(0.5)
     saved = worker.get_state()
@@ -109,7 +109,7 @@ def test_a_saved_worker_makes_the_same_blocks(swarm, make_worker, n_step):
         assert_same_block(resumed.collect(0.5), block)
 
 
-def test_the_state_is_that_of_its_moment(swarm, make_worker):
+def test_the_state_is_a_copy(swarm, make_worker):
     worker = make_worker(swarm, 3)
     saved = worker.get_state()
     kept = {name: array.copy() for name, array in saved["arrays"].items()}
@@ -118,7 +118,7 @@ def test_the_state_is_that_of_its_moment(swarm, make_worker):
         np.testing.assert_array_equal(array, kept[name], err_msg=name)
 
 
-def test_every_worker_and_every_start_has_its_own_streams(swarm, make_worker):
+def test_every_worker_and_every_incarnation_has_its_own_streams(swarm, make_worker):
     first = make_worker(swarm).collect(0.5)
     assert_same_block(first, make_worker(swarm).collect(0.5))
     for other in (make_worker(swarm, worker_id=4), make_worker(swarm, incarnation=2), make_worker(swarm, seed=8)):
@@ -130,16 +130,16 @@ def test_an_environment_without_outcomes(cart_pole, make_worker):
     blocks = [worker.collect(1.0) for _ in range(6)]
     rows, stats = transitions_of(cart_pole, blocks), join_stats([block.episodes for block in blocks])
     assert (stats.outcome == NO_OUTCOME).all() and len(stats.outcome) >= 8
-    np.testing.assert_array_equal(stats.episode_return, stats.length_steps)  # one reward a step
+    np.testing.assert_array_equal(stats.episode_return, stats.length_steps)  # the reward is 1 per step
     fallen = rows["discount"] == 0
     assert fallen.sum() == len(stats.outcome)
     beyond = (np.abs(rows["next_observation"][:, 0]) > 2.4) | (
         np.abs(rows["next_observation"][:, 2]) > 12 * np.pi / 180
     )
-    np.testing.assert_array_equal(fallen, beyond)  # final states, not the first ones of the next episodes
+    np.testing.assert_array_equal(fallen, beyond)  # final observations, not the first ones of new episodes
 
 
-def test_an_environment_that_cannot_be_saved_starts_new_episodes(cart_pole, make_worker):
+def test_an_environment_that_cannot_be_saved_starts_new_episodes_after_a_resume(cart_pole, make_worker):
     worker = make_worker(cart_pole, 3)
     worker.collect(0.5)
     saved = worker.get_state()
@@ -149,7 +149,7 @@ def test_an_environment_that_cannot_be_saved_starts_new_episodes(cart_pole, make
     assert (header.sequence, header.incarnation, header.policy_version) == (1, 2, 12)
 
 
-def test_weights_are_needed_first(swarm, make_worker):
+def test_collecting_without_weights_is_refused(swarm, make_worker):
     worker = make_worker(swarm, weights=False)
     assert worker.policy_version == -1
     with pytest.raises(RuntimeError, match="weights"):
@@ -161,7 +161,7 @@ def test_weights_are_needed_first(swarm, make_worker):
         resumed.collect(0.5)
 
 
-def test_a_block_shorter_than_n_holds_no_rows_yet(swarm, make_worker, make_weights):
+def test_a_block_shorter_than_n_steps_has_no_rows(swarm, make_worker, make_weights):
     worker = RolloutWorker(RolloutSettings(swarm, 2, 1, 5, 0.9, 0), 0, 0)
     worker.set_weights(make_weights(swarm))
     block = worker.collect(0.0)

@@ -1,4 +1,4 @@
-"""The decision table, every entry of it, and its memory."""
+"""Every entry of the decision table, and the tracker of consecutive failures."""
 
 import itertools
 import pickle
@@ -11,19 +11,19 @@ from actors.service.fault_policy import (
     MAX_RETRIES,
     Action,
     CallFailed,
+    Component,
+    ComponentFailed,
+    ComponentKind,
     Fault,
-    Mended,
-    Part,
-    PartFailed,
-    PartKind,
-    Recovery,
+    FaultTracker,
+    Recovered,
     decide,
 )
 
 ATTEMPTS = range(1, MAX_ATTEMPTS + 4)
 AGES_S = (0.0, 1.0, GIVE_UP_S, GIVE_UP_S + 0.1, 1e9)
-WORKER, SHARD = Part(PartKind.WORKER, 1), Part(PartKind.SHARD, 0)
-LEARNER, EVALUATOR = Part(PartKind.LEARNER), Part(PartKind.EVALUATOR)
+WORKER, SHARD = Component(ComponentKind.WORKER, 1), Component(ComponentKind.SHARD, 0)
+LEARNER, EVALUATOR = Component(ComponentKind.LEARNER), Component(ComponentKind.EVALUATOR)
 
 FIRST = """
                 died     late     unreachable  object lost
@@ -32,85 +32,85 @@ replay shard    restart  restart  retry        retry
 learner         rebuild  rebuild  rebuild      rebuild
 evaluation      retry    retry    retry        retry
 """
-"""What is done about a first failure, as a person would write it down."""
+"""The reaction to a first failure, as a person would write it down."""
 
 
 def written_down():
     lines = [line for line in FIRST.splitlines() if line]
     for line in lines[1:]:
-        kind = next(kind for kind in PartKind if line.startswith(kind))
+        kind = next(kind for kind in ComponentKind if line.startswith(kind))
         for fault, action in zip(Fault, line.removeprefix(kind).split(), strict=True):
             yield kind, fault, Action(action)
 
 
 def test_the_table_is_the_one_written_down():
     table = list(written_down())
-    assert len(table) == len(PartKind) * len(Fault)
+    assert len(table) == len(ComponentKind) * len(Fault)
     for kind, fault, action in table:
         assert decide(kind, fault, 1, 0.0) is action, (kind, fault)
 
 
-@pytest.mark.parametrize(("kind", "fault"), list(itertools.product(PartKind, Fault)))
-def test_every_part_is_given_up_in_the_end_and_not_before(kind, fault):
+@pytest.mark.parametrize(("kind", "fault"), list(itertools.product(ComponentKind, Fault)))
+def test_every_component_is_given_up_at_the_limits_and_not_before(kind, fault):
     for attempts, age_s in itertools.product(ATTEMPTS, AGES_S):
         stops = decide(kind, fault, attempts, age_s) is Action.STOP
         assert stops == (attempts > MAX_ATTEMPTS or age_s > GIVE_UP_S)
 
 
-@pytest.mark.parametrize(("kind", "fault"), list(itertools.product(PartKind, Fault)))
-def test_a_retry_that_does_not_help_becomes_a_replacement(kind, fault):
+@pytest.mark.parametrize(("kind", "fault"), list(itertools.product(ComponentKind, Fault)))
+def test_a_component_is_replaced_after_too_many_retries(kind, fault):
     first = decide(kind, fault, 1, 0.0)
     for attempts in range(1, MAX_ATTEMPTS + 1):
         action = decide(kind, fault, attempts, 0.0)
-        if first is Action.RETRY and kind is PartKind.SHARD:
+        if first is Action.RETRY and kind is ComponentKind.SHARD:
             assert action is (Action.RETRY if attempts <= MAX_RETRIES else Action.RESTART)
         else:
             assert action is first
 
 
-def test_only_calls_that_may_be_made_twice_are_retried():
-    for kind, fault, attempts in itertools.product(PartKind, Fault, ATTEMPTS):
+def test_only_idempotent_calls_are_retried():
+    for kind, fault, attempts in itertools.product(ComponentKind, Fault, ATTEMPTS):
         if decide(kind, fault, attempts, 0.0) is Action.RETRY:
-            assert kind in (PartKind.SHARD, PartKind.EVALUATOR)
+            assert kind in (ComponentKind.SHARD, ComponentKind.EVALUATOR)
 
 
-def failure(part, fault=Fault.DIED):
-    return PartFailed(part, 0, fault, "test")
+def failure(component, fault=Fault.DIED):
+    return ComponentFailed(component, 0, fault, "test")
 
 
-def test_failures_in_a_row_count_until_the_part_works():
-    recovery = Recovery()
-    assert [recovery.failed(failure(WORKER), i).attempts for i in range(3)] == [1, 2, 3]
-    assert recovery.worked(WORKER, 10.0) == Mended(WORKER, Fault.DIED, Action.RESTART, 3, 10.0)
-    assert recovery.worked(WORKER, 11.0) is None
-    assert recovery.failed(failure(WORKER), 12.0).attempts == 1
+def test_consecutive_failures_count_until_a_success():
+    tracker = FaultTracker()
+    assert [tracker.record_failure(failure(WORKER), i).attempts for i in range(3)] == [1, 2, 3]
+    assert tracker.record_success(WORKER, 10.0) == Recovered(WORKER, Fault.DIED, Action.RESTART, 3, 10.0)
+    assert tracker.record_success(WORKER, 11.0) is None
+    assert tracker.record_failure(failure(WORKER), 12.0).attempts == 1
 
 
-def test_parts_do_not_count_for_each_other():
-    recovery = Recovery()
+def test_failures_are_counted_per_component():
+    tracker = FaultTracker()
     for _ in range(MAX_ATTEMPTS):
-        recovery.failed(failure(WORKER), 0.0)
-    for part in (Part(PartKind.WORKER, 2), SHARD, LEARNER, EVALUATOR):
-        assert recovery.failed(failure(part), 0.0).attempts == 1
-    assert recovery.failed(failure(WORKER), 0.0).action is Action.STOP
+        tracker.record_failure(failure(WORKER), 0.0)
+    for component in (Component(ComponentKind.WORKER, 2), SHARD, LEARNER, EVALUATOR):
+        assert tracker.record_failure(failure(component), 0.0).attempts == 1
+    assert tracker.record_failure(failure(WORKER), 0.0).action is Action.STOP
 
 
-def test_the_age_counts_from_the_first_failure_in_a_row():
-    recovery = Recovery()
-    recovery.failed(failure(LEARNER), 100.0)
-    assert recovery.failed(failure(LEARNER), 100.0 + GIVE_UP_S).action is Action.REBUILD
-    assert recovery.failed(failure(LEARNER), 100.1 + GIVE_UP_S).action is Action.STOP
+def test_the_age_counts_from_the_first_consecutive_failure():
+    tracker = FaultTracker()
+    tracker.record_failure(failure(LEARNER), 100.0)
+    assert tracker.record_failure(failure(LEARNER), 100.0 + GIVE_UP_S).action is Action.REBUILD
+    assert tracker.record_failure(failure(LEARNER), 100.1 + GIVE_UP_S).action is Action.STOP
 
 
-def test_a_part_that_became_unreachable_and_then_died_is_replaced():
-    recovery = Recovery()
-    assert recovery.failed(failure(SHARD, Fault.UNREACHABLE), 0.0).action is Action.RETRY
-    assert recovery.failed(failure(SHARD, Fault.DIED), 0.0).action is Action.RESTART
+def test_a_component_that_became_unreachable_and_then_died_is_replaced():
+    tracker = FaultTracker()
+    assert tracker.record_failure(failure(SHARD, Fault.UNREACHABLE), 0.0).action is Action.RETRY
+    assert tracker.record_failure(failure(SHARD, Fault.DIED), 0.0).action is Action.RESTART
 
 
-def test_failures_name_the_part_and_travel_between_processes():
-    for error in (PartFailed(WORKER, 3, Fault.LATE, "collect: silent for 9 s"), CallFailed(Fault.DIED, "gone")):
+def test_failures_name_the_component_and_can_be_pickled():
+    for error in (ComponentFailed(WORKER, 3, Fault.LATE, "collect: silent for 9 s"), CallFailed(Fault.DIED, "gone")):
         again = pickle.loads(pickle.dumps(error))
         assert type(again) is type(error) and vars(again) == vars(error)
-    assert str(PartFailed(WORKER, 3, Fault.LATE, "silent")) == "rollout worker 1 late (silent)"
-    assert [str(part) for part in (SHARD, LEARNER, EVALUATOR)] == ["replay shard 0", "learner", "evaluation"]
+    assert str(ComponentFailed(WORKER, 3, Fault.LATE, "silent")) == "rollout worker 1 late (silent)"
+    assert [str(component) for component in (SHARD, LEARNER, EVALUATOR)] == ["replay shard 0", "learner", "evaluation"]

@@ -1,17 +1,17 @@
-"""What a process has freed goes back to the system, holes in its heap too."""
+"""Freed memory goes back to the OS, holes inside the heap included."""
 
 import subprocess
 import sys
 
 import pytest
 
-from actors.storage import malloc as memory
+from actors.storage import malloc
 
-pytestmark = pytest.mark.skipif(memory._trim is None, reason="a C library other than glibc")
+pytestmark = pytest.mark.skipif(malloc._trim is None, reason="a C library other than glibc")
 
 LIBC = """
 import ctypes, psutil
-from actors.storage.malloc import give_back, keep_large_apart
+from actors.storage.malloc import trim_heap, limit_fragmentation
 libc = ctypes.CDLL(None)
 libc.malloc.restype = ctypes.c_void_p
 libc.free.argtypes = [ctypes.c_void_p]
@@ -21,26 +21,26 @@ def own_mb():
 """
 HOLES = """
 taken = [libc.malloc(60_000) for _ in range(2_000)]
-for place in taken:
-    ctypes.memset(ctypes.c_void_p(place), 1, 60_000)
-for place in taken[:-1]:  # the last one holds the end of the heap
-    libc.free(place)
+for pointer in taken:
+    ctypes.memset(ctypes.c_void_p(pointer), 1, 60_000)
+for pointer in taken[:-1]:  # the last one keeps the top of the heap in use
+    libc.free(pointer)
 before = own_mb()
-give_back()
+trim_heap()
 print(before - own_mb())
 """
 LARGE = """
-libc.free(libc.malloc(30_000_000))  # whereupon glibc keeps pieces of up to this size in its heap
+libc.free(libc.malloc(30_000_000))  # after this, glibc serves allocations up to this size from the heap
 {}
 taken = []
 for _ in range(200):
-    place = libc.malloc(600_000)
-    ctypes.memset(ctypes.c_void_p(place), 1, 600_000)
-    taken.append(place)
-    libc.malloc(2_000)  # which stays
+    pointer = libc.malloc(600_000)
+    ctypes.memset(ctypes.c_void_p(pointer), 1, 600_000)
+    taken.append(pointer)
+    libc.malloc(2_000)  # stays allocated
 held = own_mb()
-for place in taken:
-    libc.free(place)
+for pointer in taken:
+    libc.free(pointer)
 print(held - own_mb())
 """
 
@@ -50,10 +50,10 @@ def printed(program):
     return float(done.stdout)
 
 
-def test_holes_in_the_heap_go_back_to_the_system():
+def test_trimming_returns_holes_in_the_heap():
     assert printed(HOLES) > 80  # MB, of 120
 
 
-def test_large_pieces_go_back_to_the_system_when_they_are_freed():
+def test_large_allocations_go_back_to_the_os_when_they_are_freed():
     assert printed(LARGE.format("")) < 20  # MB, of 120
-    assert printed(LARGE.format("keep_large_apart()")) > 100
+    assert printed(LARGE.format("limit_fragmentation()")) > 100

@@ -1,4 +1,4 @@
-"""A snapshot of a ring holds the rows of its moment, whatever is inserted while it is read."""
+"""A snapshot of a ring holds the rows of its moment, whatever is inserted during reading."""
 
 import threading
 
@@ -32,7 +32,7 @@ def add(shard, numbers, sequence):
     pieces=st.integers(1, 4),
 )
 @settings(deadline=None)
-def test_inserts_between_any_two_reads_change_nothing(capacity, before, after, pieces):
+def test_inserts_between_reads_change_nothing(capacity, before, after, pieces):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ring_snapshot, "PIECE_ROWS", 4)
         shard, total = ReplayShard(DTYPE, capacity, 0), 0
@@ -54,7 +54,7 @@ def test_inserts_between_any_two_reads_change_nothing(capacity, before, after, p
         np.testing.assert_array_equal(rows, expected)
 
 
-def test_a_thread_reads_what_was_there_while_another_inserts():
+def test_a_thread_reads_the_snapshot_while_another_inserts():
     shard = ReplayShard(DTYPE, 40_000, 0)
     for i in range(5):
         add(shard, range(10_000 * i, 10_000 * (i + 1)), i)
@@ -71,10 +71,10 @@ def test_a_thread_reads_what_was_there_while_another_inserts():
         add(shard, range(1_000_000 + 3_000 * i, 1_000_000 + 3_000 * (i + 1)), 100 + i)
     reader.join()
     np.testing.assert_array_equal(np.concatenate(found), expected)
-    assert not snapshot._saved, "what was copied is handed over"
+    assert not snapshot._saved, "copies are handed over"
 
 
-def test_a_closed_snapshot_costs_nothing_more():
+def test_a_closed_snapshot_copies_nothing():
     shard = ReplayShard(DTYPE, 10_000, 0)
     add(shard, range(10_000), 0)
     snapshot = shard.snapshot().rows

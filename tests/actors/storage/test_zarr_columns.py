@@ -1,10 +1,10 @@
-"""Rows in zarr: readable by anybody, and never read back damaged."""
+"""Rows in zarr: readable with zarr alone, and damage is detected."""
 
 import numpy as np
 import pytest
 import zarr
 
-from actors.storage import zarr_columns as storage
+from actors.storage import zarr_columns
 from actors.storage.zarr_columns import load_rows, save_rows
 
 DTYPE = np.dtype([("reward", "f4"), ("action", "i4"), ("observation", "i1", (2, 3))], align=True)
@@ -24,8 +24,8 @@ def chunk_files(path):
 
 @pytest.fixture
 def saved(tmp_path, monkeypatch):
-    """A group of several chunks a column."""
-    monkeypatch.setattr(storage, "CHUNK_ROWS", 20)
+    """A group with several chunks per column."""
+    monkeypatch.setattr(zarr_columns, "CHUNK_ROWS", 20)
     save_rows(tmp_path / "rows.zarr", make_rows())
     return tmp_path / "rows.zarr"
 
@@ -46,7 +46,7 @@ def test_zarr_alone_reads_the_columns(saved):
     assert sorted(root.array_keys()) == sorted(DTYPE.names)
     for name in DTYPE.names:
         np.testing.assert_array_equal(root[name][...], make_rows()[name], err_msg=name)
-    assert root.attrs["rows"] == 50 and root.attrs["format"] == storage.FORMAT
+    assert root.attrs["rows"] == 50 and root.attrs["format"] == zarr_columns.FORMAT
 
 
 def test_a_new_save_replaces_the_old(saved):
@@ -54,7 +54,7 @@ def test_a_new_save_replaces_the_old(saved):
     assert_same(load_rows(saved, DTYPE), make_rows(7))
 
 
-def test_a_flipped_byte_in_any_chunk_is_noticed(saved):
+def test_a_flipped_bit_in_any_chunk_is_detected(saved):
     files = chunk_files(saved)
     assert len(files) == 9  # three chunks in each of three columns
     for i, file in enumerate(files):
@@ -68,7 +68,7 @@ def test_a_flipped_byte_in_any_chunk_is_noticed(saved):
     assert_same(load_rows(saved, DTYPE), make_rows())
 
 
-def test_a_missing_chunk_is_noticed_although_zarr_reads_zeros(saved):
+def test_a_missing_chunk_is_detected_although_zarr_reads_zeros(saved):
     for file in chunk_files(saved):
         whole = file.read_bytes()
         file.unlink()
@@ -77,7 +77,7 @@ def test_a_missing_chunk_is_noticed_although_zarr_reads_zeros(saved):
         file.write_bytes(whole)
 
 
-def test_a_cut_chunk_is_noticed(saved):
+def test_a_truncated_chunk_is_detected(saved):
     file = chunk_files(saved)[0]
     file.write_bytes(file.read_bytes()[:-3])
     with pytest.raises(ValueError):
@@ -85,7 +85,7 @@ def test_a_cut_chunk_is_noticed(saved):
 
 
 @pytest.mark.parametrize("name", ["zarr.json", "reward/zarr.json", "observation/zarr.json"])
-def test_missing_metadata_is_noticed(saved, name):
+def test_missing_metadata_is_detected(saved, name):
     (saved / name).unlink()
     with pytest.raises(ValueError):
         load_rows(saved, DTYPE)
@@ -105,7 +105,7 @@ def test_other_columns_are_refused(saved, other):
         load_rows(saved, np.dtype(other))
 
 
-def test_what_is_no_replay_is_refused(tmp_path):
+def test_anything_but_saved_rows_is_refused(tmp_path):
     with pytest.raises(ValueError, match="incomplete"):
         load_rows(tmp_path / "nothing.zarr", DTYPE)
     zarr.open_group(str(tmp_path / "other.zarr"), mode="w")
@@ -113,30 +113,30 @@ def test_what_is_no_replay_is_refused(tmp_path):
         load_rows(tmp_path / "other.zarr", DTYPE)
 
 
-def test_a_store_of_zarr_format_2_is_refused_whatever_it_holds(tmp_path):
-    """Among the codecs of format 2 is pickle."""
+def test_a_store_in_zarr_format_2_is_refused(tmp_path):
+    """Format 2 allows the pickle codec, which runs code from the file."""
     root = zarr.open_group(str(tmp_path / "old.zarr"), mode="w", zarr_format=2)
-    root.attrs.update({"format": storage.FORMAT, "rows": 0, "crc32": {}})
+    root.attrs.update({"format": zarr_columns.FORMAT, "rows": 0, "crc32": {}})
     with pytest.raises(ValueError, match="missing or incomplete"):
         load_rows(tmp_path / "old.zarr", DTYPE)
 
 
 @pytest.mark.parametrize("rows", [10**15, -1, "50", 50.0, None, [50]])
-def test_rows_that_cannot_be_are_refused_before_memory_is_taken(saved, rows):
+def test_an_impossible_number_of_rows_is_refused_before_memory_is_allocated(saved, rows):
     zarr.open_group(str(saved), mode="r+").attrs["rows"] = rows
     with pytest.raises(ValueError, match="claims"):
         load_rows(saved, DTYPE)
 
 
-def test_more_rows_than_fit_are_refused(saved):
+def test_more_rows_than_accepted_are_refused(saved):
     load_rows(saved, DTYPE, at_most=50)
     with pytest.raises(ValueError, match="claims 50 rows; at most 49"):
         load_rows(saved, DTYPE, at_most=49)
 
 
-def test_columns_that_claim_more_than_they_hold_are_refused(tmp_path):
+def test_columns_longer_than_the_declared_rows_are_refused(tmp_path):
     root = zarr.open_group(str(tmp_path / "huge.zarr"), mode="w", zarr_format=3)
     root.create_array("reward", shape=(10**14,), dtype="f4", chunks=(10**9,))
-    root.attrs.update({"format": storage.FORMAT, "rows": 5, "crc32": {"reward": 0}})
+    root.attrs.update({"format": zarr_columns.FORMAT, "rows": 5, "crc32": {"reward": 0}})
     with pytest.raises(ValueError, match=r"reward.*not float32\(5,\)"):
         load_rows(tmp_path / "huge.zarr", np.dtype([("reward", "f4")]))

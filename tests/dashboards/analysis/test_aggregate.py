@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from actors.evaluation.statistics import Estimate, rate, rate_difference
+from actors.evaluation.statistics import Estimate, rate
 from dashboards.analysis.aggregate import (
     GROUPS,
     Cell,
@@ -101,13 +101,36 @@ def test_refuses_a_seed_twice():
         Results([row("sensor", HOME, success=90), row("sensor", HOME, success=80)])
 
 
-def test_difference_is_newcombes_published_example():
-    """Newcombe 1998, table II, (a) 56/70 - 48/80 by method 10: 0.0524 to 0.3339."""
-    found = difference(of(56, 70), of(48, 80))
+@pytest.mark.parametrize(
+    ("first", "second", "low", "high"),
+    [
+        ((56, 70), (48, 80), 0.0524, 0.3339),
+        ((9, 10), (3, 10), 0.1705, 0.8090),
+        ((6, 7), (2, 7), 0.0582, 0.8062),
+        ((5, 56), (0, 29), -0.0381, 0.1926),
+        ((0, 10), (0, 20), -0.1611, 0.2775),
+        ((10, 10), (0, 20), 0.6791, 1.0),
+    ],
+)
+def test_difference_against_published_numbers(first: tuple[int, int], second: tuple[int, int], low: float, high: float):
+    """R. G. Newcombe 1998, "Interval estimation for the difference between independent proportions", Table II (10)."""
+    found = difference(of(*first), of(*second))
     assert found is not None
-    assert found.estimate == pytest.approx(Estimate(0.2, 0.0524, 0.3339), abs=5e-5)
-    assert found.estimate == pytest.approx(rate_difference((56, 70), (48, 80)))
-    assert found.episodes == 150
+    one, two = rate(*first), rate(*second)
+    value = first[0] / first[1] - second[0] / second[1]
+    assert found.estimate == pytest.approx(Estimate(value, low, high), abs=5e-5)
+    below, above = (
+        np.hypot(one.value - one.low, two.high - two.value),
+        np.hypot(one.high - one.value, two.value - two.low),
+    )
+    assert found.estimate == pytest.approx((value, value - below, value + above))
+    assert found.episodes == first[1] + second[1]
+
+
+def test_a_swapped_difference_changes_its_sign():
+    forth, back = difference(of(7, 30), of(50, 90)), difference(of(50, 90), of(7, 30))
+    assert forth is not None and back is not None
+    assert forth.estimate == pytest.approx((-back.estimate.value, -back.estimate.high, -back.estimate.low))
 
 
 def test_mean_weighs_cells_alike_whatever_their_episodes():

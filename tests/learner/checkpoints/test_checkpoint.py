@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from actors.storage.part_writer import PartWriter, file_sum, join_written
-from actors.storage.uri import inside
+from actors.storage.fragment_writer import FragmentWriter, file_sum, join_results
+from actors.storage.uri import join_location
 from learner.checkpoints.checkpoint import (
     Keep,
     best_valid,
@@ -38,10 +38,10 @@ def save_parts(draft, seed=0):
     writes = {"a.bin": lambda path: path.write_bytes(first), "rows.zarr": rows, "empty.bin": Path.touch}
     parts = []
     for name, write in writes.items():
-        writer = PartWriter()
-        writer.start(inside(draft, name), write)
+        writer = FragmentWriter()
+        writer.start(join_location(draft, name), write)
         parts.append(writer.result(30.0))
-    written = join_written(parts)
+    written = join_results(parts)
     assert written.error is None
     return written.files
 

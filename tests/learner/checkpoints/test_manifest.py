@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors.storage.part_writer import FileSum
+from actors.storage.fragment_writer import FileSum
 from learner.checkpoints.manifest import (
     CheckpointError,
     Manifest,

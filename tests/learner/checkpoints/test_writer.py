@@ -7,10 +7,10 @@ import uuid
 import fsspec
 import pytest
 
-from actors.service.fault_policy import CallFailed, Fault, Part, PartFailed, PartKind
+from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, Fault
 from actors.service.rpc import LocalCalls
-from actors.storage.part_writer import PartWriter
-from actors.storage.uri import as_location, check_writable, fetched, inside
+from actors.storage.fragment_writer import FragmentWriter
+from actors.storage.uri import check_writable, fetched, join_location, parse_location
 from learner.checkpoints.checkpoint import Keep, newest_valid
 from learner.checkpoints.manifest import CheckpointError, UselessCheckpointError
 from learner.checkpoints.retention import Scored
@@ -24,13 +24,13 @@ class Node:
     def __init__(self, name):
         self.name, self.content, self.go = name, b"", threading.Event()
         self.go.set()
-        self._writer = PartWriter()
+        self._writer = FragmentWriter()
         self.fails = False
         self.fault = None
 
     def save(self, draft, content):
         self.content = content
-        self._writer.start(inside(draft, self.name), self._write)
+        self._writer.start(join_location(draft, self.name), self._write)
 
     def _write(self, path):
         self.go.wait(60)
@@ -51,7 +51,7 @@ class Run:
     def __init__(self, root):
         self.root = root
         self.nodes = {name: Node(name) for name in ("learner", "worker")}
-        parts = (Part(PartKind.LEARNER), Part(PartKind.WORKER, 3))
+        parts = (Component(ComponentKind.LEARNER), Component(ComponentKind.WORKER, 3))
         self.writers = [Writer(part, 7, node) for part, node in zip(parts, self.nodes.values(), strict=True)]
         self.checkpointer = Checkpointer(root, LocalCalls(), 60.0)
         self.scores = []
@@ -88,10 +88,10 @@ class Run:
 @pytest.fixture(params=["folder", "memory", "s3"])
 def run(request, tmp_path):
     if request.param == "folder":
-        return Run(as_location(f"file://{tmp_path}/checkpoints"))
+        return Run(parse_location(f"file://{tmp_path}/checkpoints"))
     if request.param == "memory":
-        return Run(as_location(f"memory://{uuid.uuid4()}/checkpoints/"))
-    return Run(as_location(f"{request.getfixturevalue('s3_server')}/{uuid.uuid4()}"))
+        return Run(parse_location(f"memory://{uuid.uuid4()}/checkpoints/"))
+    return Run(parse_location(f"{request.getfixturevalue('s3_server')}/{uuid.uuid4()}"))
 
 
 def test_what_was_written_is_read_back(run):
@@ -101,7 +101,7 @@ def test_what_was_written_is_read_back(run):
     assert found.folder == ended.location and not skipped
     assert found.state == {"env_steps": 100, "updates": 5}
     for name in run.nodes:
-        with fetched(inside(found.folder, name)) as path:
+        with fetched(join_location(found.folder, name)) as path:
             assert (path / "rows").read_bytes() == f"{name} at 100, 5".encode()
             assert sorted(file.name for file in path.iterdir()) == ["more", "rows"]
 
@@ -167,7 +167,11 @@ def test_a_part_that_fails_is_told_once_the_others_have_written(run, fault):
     slow.go.set()
     ended = run.checkpointer.wait()
     assert ended.location is None and "rollout worker 3" in ended.error
-    assert (ended.failure.part, ended.failure.incarnation, ended.failure.fault) == (run.writers[1].part, 7, fault)
+    assert (ended.failure.component, ended.failure.incarnation, ended.failure.fault) == (
+        run.writers[1].component,
+        7,
+        fault,
+    )
     assert run.files() == before
     run.nodes["worker"].fault = None
     assert run.write(300).error is None and newest_valid(run.root)[0].state["env_steps"] == 300
@@ -177,7 +181,7 @@ def test_a_checkpoint_that_could_not_begin_waits_for_those_who_had_begun(run):
     slow = run.nodes["learner"]
     slow.go.clear()
     run.save(100)
-    failure = PartFailed(run.writers[1].part, 7, Fault.DIED, "simulated")
+    failure = ComponentFailed(run.writers[1].component, 7, Fault.DIED, "simulated")
     run.checkpointer.drop(Moment(100, 0, 700), run.writers[:1], failure)
     assert run.checkpointer.is_busy and run.checkpointer.poll() is None
     slow.go.set()
@@ -289,7 +293,7 @@ def test_urls_that_cannot_work_are_refused_with_a_sentence(s3_server):
     with pytest.raises(ConfigError, match="nosuchprotocol://x cannot be opened"):
         check_writable("nosuchprotocol://x")
     with pytest.raises(ConfigError, match="must not hold a user or password"):
-        as_location("s3://key:secret@bucket/x")
+        parse_location("s3://key:secret@bucket/x")
     check_writable(f"{s3_server}/fine")
     with pytest.raises(CheckpointError, match="cannot be listed"):
         newest_valid("s3://no-such-bucket-here/x")

@@ -3,7 +3,7 @@
 import pytest
 from ray import exceptions as ray_errors
 
-from actors.service.fault_policy import CallFailed, Fault, Part, PartFailed, PartKind
+from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, Fault
 from learner.ray_backend import cluster as ray_edge
 from learner.ray_backend.cluster import RayCalls
 
@@ -47,7 +47,11 @@ def test_a_failure_of_the_system_is_a_fault(get, error, fault):
 
 
 @pytest.mark.parametrize(
-    "cause", [PartFailed(Part(PartKind.SHARD, 1), 3, Fault.LATE, "silent"), CallFailed(Fault.OBJECT_LOST, "no weights")]
+    "cause",
+    [
+        ComponentFailed(Component(ComponentKind.SHARD, 1), 3, Fault.LATE, "silent"),
+        CallFailed(Fault.OBJECT_LOST, "no weights"),
+    ],
 )
 def test_a_fault_that_a_part_met_comes_out_as_it_is(get, cause):
     raised = get(ray_errors.RayTaskError("update", "trace", cause).as_instanceof_cause())

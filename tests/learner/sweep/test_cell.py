@@ -14,7 +14,7 @@ from actors.evaluation.evaluator import evaluate
 from actors.evaluation.result_table import read_table
 from actors.policy.baselines import Baseline
 from actors.rollout.vector_env import env_shape
-from actors.storage.part_writer import sync_all
+from actors.storage.fragment_writer import sync_all
 from learner.checkpoints.checkpoint import finished_names
 from learner.checkpoints.manifest import CheckpointError
 from learner.export.policy_file import read_saved_policy
@@ -238,10 +238,12 @@ def test_nothing_writes_on_after_a_crash(store, cell, tmp_path, monkeypatch):
         time.sleep(0.5)
         sync_all(path)
 
-    monkeypatch.setattr("actors.storage.part_writer.sync_all", slow_sync)
+    monkeypatch.setattr("actors.storage.fragment_writer.sync_all", slow_sync)
     with pytest.raises(Crash):
         run_cell(SWEEP, cell, SweepPlace(tmp_path, store, "cells"), crashing_at(1_500))  # one begins at 1,000
-    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith(("shoal-part", "shoal-ch"))]
+    assert not [
+        thread.name for thread in threading.enumerate() if thread.name.startswith(("shoal-fragment", "shoal-ch"))
+    ]
     checkpoints = tmp_path / cell.key / "checkpoints"
     assert [path.name for path in checkpoints.iterdir()] == finished_names(checkpoints)
 

@@ -1,16 +1,16 @@
 """The log of faults: whole lines come back, half ones of killed drivers do not."""
 
-from actors.service.fault_policy import Action, Decision, Fault, Mended, Part, PartFailed, PartKind
+from actors.service.fault_policy import Action, Component, ComponentFailed, ComponentKind, Decision, Fault, Recovered
 from learner.tracking.fault_log import FaultLog, read_faults
 
-WORKER = Part(PartKind.WORKER, 2)
+WORKER = Component(ComponentKind.WORKER, 2)
 
 
 def test_events_come_back_in_order(tmp_path):
     path = tmp_path / "run" / "faults.jsonl"
     log = FaultLog(path)
-    log.failed(PartFailed(WORKER, 0, Fault.LATE, "silent"), Decision(Action.RESTART, 2))
-    log.mended(Mended(WORKER, Fault.LATE, Action.RESTART, 2, 1.5))
+    log.failed(ComponentFailed(WORKER, 0, Fault.LATE, "silent"), Decision(Action.RESTART, 2))
+    log.mended(Recovered(WORKER, Fault.LATE, Action.RESTART, 2, 1.5))
     log.resumed()
     entries = read_faults(path)
     assert [entry[1:] for entry in entries] == [

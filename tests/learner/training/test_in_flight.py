@@ -2,11 +2,11 @@
 
 import pytest
 
-from actors.service.fault_policy import CallFailed, Fault, Part, PartKind
+from actors.service.fault_policy import CallFailed, Component, ComponentKind, Fault
 from learner.training.in_flight import Pending, UnderWay
 
-WORKERS = [Part(PartKind.WORKER, i) for i in range(2)]
-LEARNER, EVALUATOR = Part(PartKind.LEARNER), Part(PartKind.EVALUATOR)
+WORKERS = [Component(ComponentKind.WORKER, i) for i in range(2)]
+LEARNER, EVALUATOR = Component(ComponentKind.LEARNER), Component(ComponentKind.EVALUATOR)
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def test_nobody_is_late_before_the_deadline(under_way, clock):
     assert under_way.late([]) == [] and under_way.patience_s() == pytest.approx(0.1)
     clock[0] += 0.1
     (failure,) = under_way.late([])
-    assert (failure.part, failure.incarnation, failure.fault) == (WORKERS[0], 0, Fault.LATE)
+    assert (failure.component, failure.incarnation, failure.fault) == (WORKERS[0], 0, Fault.LATE)
     assert str(failure) == "rollout worker 0 late (collect: silent for 10 s)"
     assert under_way.patience_s() == 0.0
 
@@ -79,7 +79,7 @@ def test_who_answers_is_given_the_whole_deadline_again(under_way, clock):
     clock[0] += 9
     assert under_way.late([]) == []
     clock[0] += 1
-    assert [failure.part for failure in under_way.late([])] == [LEARNER]
+    assert [failure.component for failure in under_way.late([])] == [LEARNER]
 
 
 def test_who_owes_nothing_is_never_late(under_way, clock):
@@ -98,7 +98,7 @@ def test_an_answer_that_waits_to_be_taken_is_not_late(under_way, clock):
     under_way.add("a", collect(0))
     under_way.add("b", collect(1))
     clock[0] += 50
-    assert [failure.part for failure in under_way.late(["a"])] == [WORKERS[1]]
+    assert [failure.component for failure in under_way.late(["a"])] == [WORKERS[1]]
 
 
 def test_a_part_that_starts_has_more_time_and_so_has_its_replacement(under_way, clock):
@@ -129,13 +129,13 @@ def test_each_late_part_is_named_once(under_way, clock):
     for ref, pending in (("a", collect(0)), ("b", collect(0)), ("c", collect(1)), ("u", update()), ("v", update())):
         under_way.add(ref, pending)
     clock[0] += 60
-    assert {failure.part for failure in under_way.late([])} == {*WORKERS, LEARNER}
+    assert {failure.component for failure in under_way.late([])} == {*WORKERS, LEARNER}
     assert len(under_way.late([])) == 3
 
 
 def test_a_failed_call_names_its_part():
     failure = collect(1, 7).failed(CallFailed(Fault.OBJECT_LOST, "gone"))
-    assert (failure.part, failure.incarnation, failure.fault, failure.reason) == (
+    assert (failure.component, failure.incarnation, failure.fault, failure.reason) == (
         WORKERS[1],
         7,
         Fault.OBJECT_LOST,

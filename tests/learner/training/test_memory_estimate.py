@@ -50,7 +50,7 @@ def bytes_of_a_full_shard(config):
     worker.set_weights(cluster.learner.weights())
     while shard.size < config.replay_capacity:
         worker.collect(0.5)
-    return shard._rows.nbytes + shard._frames.frames.nbytes
+    return shard._rows.nbytes + shard._frames.slots.nbytes
 
 
 def test_the_estimates_are_those_of_what_is_made(small_run):

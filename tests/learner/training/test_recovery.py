@@ -10,7 +10,7 @@ import pytest
 from actors.replay.node import ShardNode
 from actors.rollout import node as rollout_node
 from actors.rollout.node import RolloutNode
-from actors.service.fault_policy import Action, Fault, PartKind, Recovery, RunFailed
+from actors.service.fault_policy import Action, ComponentKind, Fault, FaultTracker, RunFailed
 from learner.checkpoints.checkpoint import newest_valid
 from learner.checkpoints.writer import Checkpointer
 from learner.loop import TrainingLoop
@@ -81,7 +81,7 @@ def run(monkeypatch, tmp_path):
         cluster = process_cluster(config, 0)._replace(collects_in_flight=2, blocks_in_flight=2 * config.workers)
         listener = Listener()
         with closing(Journal(tmp_path / "metrics.jsonl", 0)) as journal:
-            loop = TrainingLoop(config, cluster, journal, tmp_path / "checkpoints", listener, bool, Recovery())
+            loop = TrainingLoop(config, cluster, journal, tmp_path / "checkpoints", listener, bool, FaultTracker())
             assert loop.run()
         return loop, calls, listener, cluster
 
@@ -134,7 +134,7 @@ def test_a_run_without_faults_has_nothing_to_mend(run, config):
     loop, calls, listener, cluster = run(config, lambda node, method: None)
     assert not listener.failures and calls.faults == 0
     assert sum(loop._progress.ledger.dropped.values()) == 0
-    assert sum(shard.shard.inserted for shard in cluster.targets) == loop._progress.ledger.stored
+    assert sum(shard.shard.get_state()["inserted"] for shard in cluster.targets) == loop._progress.ledger.stored
     assert_accounts(loop, listener, config)
 
 
@@ -147,7 +147,7 @@ def test_workers_that_fail_at_random_lose_nothing_that_was_delivered(run, config
     assert_accounts(loop, listener, config)
     assert loop._progress.ledger.dropped["shard lost"] == 0
     shards = [node.shard for node in (cluster.targets if placement == "actors" else cluster.learner._shards)]
-    assert sum(shard.inserted for shard in shards) == loop._progress.ledger.stored
+    assert sum(shard.get_state()["inserted"] for shard in shards) == loop._progress.ledger.stored
     assert loop.updates > 50
 
 
@@ -164,8 +164,8 @@ def test_shards_that_fail_at_random_are_rebuilt_empty(run, config, seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_everything_but_the_learner_fails_at_random(run, config, seed):
     loop, calls, listener, cluster = run(config, at_random(seed, 0.04, KINDS, (RolloutNode, ShardNode)), seed)
-    kinds = {failure.part.kind for failure, _ in listener.failures}
-    assert calls.faults >= 8 and kinds == {PartKind.WORKER, PartKind.SHARD}
+    kinds = {failure.component.kind for failure, _ in listener.failures}
+    assert calls.faults >= 8 and kinds == {ComponentKind.WORKER, ComponentKind.SHARD}
     assert_accounts(loop, listener, config)
     assert loop._progress.ledger.replay_size == sum(shard.size() for shard in cluster.targets)
     assert loop.updates > 50
@@ -176,10 +176,10 @@ def test_a_push_whose_reply_is_lost_is_stored_once(run, config, kind):
     loop, calls, listener, cluster = run(config, at_random(0, 0.1, (kind,), ShardNode))
     assert calls.faults >= 20
     assert_accounts(loop, listener, config)
-    inserted = sum(shard.shard.inserted for shard in cluster.targets)
+    inserted = sum(shard.shard.get_state()["inserted"] for shard in cluster.targets)
     if not any(decision.action is Action.RESTART for _, decision in listener.failures):
         assert inserted == loop._progress.ledger.stored
-    refused = sum(shard.shard.dropped for shard in cluster.targets)
+    refused = sum(shard.shard.get_state()["dropped"] for shard in cluster.targets)
     assert (refused > 0) == (kind == "unreachable after")
 
 
@@ -187,11 +187,11 @@ def test_a_restarted_worker_has_a_new_incarnation_fresh_streams_and_the_current_
     loop, _, listener, cluster = run(config, once(RolloutNode, "collect", "dies before", 40))
     ((failure, decision),) = listener.failures
     assert (failure.fault, decision.action) == (Fault.DIED, Action.RESTART)
-    worker_id = failure.part.number
+    worker_id = failure.component.number
     incarnations = [worker._worker._incarnation for worker in cluster.workers]
     assert incarnations == [1 if i == worker_id else 0 for i in range(3)]
     assert cluster.workers[worker_id]._worker.policy_version > 0
-    assert [mended.part for mended in listener.mends] == [failure.part]
+    assert [mended.component for mended in listener.mends] == [failure.component]
     state = newest_valid(tmp_path / "checkpoints")[0].state
     assert state["incarnation"] == 1
 
@@ -200,7 +200,9 @@ def test_the_old_incarnation_of_a_worker_is_refused_everywhere(run, config):
     loop, calls, listener, cluster = run(config, once(RolloutNode, "collect", "unreachable after", 10))
     ((failure, _),) = listener.failures
     stored = loop._progress.ledger.stored
-    zombie = RolloutNode(cluster_module.rollout_settings(config), failure.part.number, 0, calls, cluster.targets, 0)
+    zombie = RolloutNode(
+        cluster_module.rollout_settings(config), failure.component.number, 0, calls, cluster.targets, 0
+    )
     zombie.set_weights(loop.newest_weights())
     zombie._worker._sequence = 1_000  # blocks that no shard has seen
     for _ in range(3):
@@ -247,7 +249,7 @@ def test_a_shard_lost_while_a_worker_is_being_replaced_is_replaced_first(run, co
 
     calls_seen = []
     loop, _, listener, _ = run(config, fault)
-    assert [failure.part.kind for failure, _ in listener.failures] == [PartKind.WORKER, PartKind.SHARD]
+    assert [failure.component.kind for failure, _ in listener.failures] == [ComponentKind.WORKER, ComponentKind.SHARD]
     assert_accounts(loop, listener, config)
 
 

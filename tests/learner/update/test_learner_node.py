@@ -8,7 +8,7 @@ from scipy import stats
 
 from actors.policy.network import Policy, WeightsSnapshot
 from actors.replay.node import ShardNode, ShardSettings
-from actors.replay.prioritised import SMALLEST, PrioritySettings
+from actors.replay.prioritised import PRIORITY_EPSILON, PrioritySettings
 from actors.rollout.worker import join_stats
 from actors.service.messages import SCHEMA_VERSION, BlockHeader, TransitionBlock
 from actors.service.rpc import Done, LocalCalls
@@ -292,7 +292,7 @@ def test_td_errors_go_back_to_the_rows_that_they_are_of(make_learner, make_rows,
     assert 1 < len(drawn) <= 16
     for i, (shard, size) in enumerate(zip(shards, sizes, strict=True)):
         rows = numbered(make_rows, size, 1000 * i)
-        changed = (np.abs(td_errors_by_hand(weights, rows)) + SMALLEST) ** 0.5
+        changed = (np.abs(td_errors_by_hand(weights, rows)) + PRIORITY_EPSILON) ** 0.5
         new = [1000 * i + number in drawn for number in range(size)]
         np.testing.assert_allclose(shard.shard.priorities, np.where(new, changed, 1.0), rtol=1e-5)
 
@@ -313,7 +313,7 @@ def test_rows_of_all_shards_are_drawn_in_proportion_to_their_priorities(make_lea
         numbers = sample.columns["reward"].astype(int)
         expected = [shares[number // 1000][number % 1000] for number in numbers]
         np.testing.assert_allclose(sample.draws.probability, expected, rtol=1e-9)
-        np.testing.assert_array_equal(sample.draws.number, numbers % 1000)
+        np.testing.assert_array_equal(sample.draws.insertion_index, numbers % 1000)
         if len(sizes) > 1:
             np.testing.assert_array_equal(sample.shard, numbers // 1000)
 
@@ -328,7 +328,7 @@ def test_updates_count_their_rows_by_importance(make_learner, make_rows, learner
     learner.update(3, RATE, exponent)
     plain = Learner(learner_settings)
     sample = other.sample(3 * 16)
-    probability = other.shard.priorities[sample.draws.number] / other.shard.priorities.sum()
+    probability = other.shard.priorities[sample.draws.insertion_index] / other.shard.priorities.sum()
     plain.update(sample.columns, RATE, importance_weights(probability, 16, exponent))
     for array, expected in zip(learner.weights().arrays, plain.weights(0.0).arrays, strict=True):
         np.testing.assert_array_equal(array, expected)
@@ -351,7 +351,7 @@ def test_rows_that_were_overwritten_meanwhile_keep_their_successors_priorities(m
     learner, (shard,) = make_learner(priorities=HALF, calls=OvertakenCalls(blocks))
     shard.add(make_block(make_rows(50)))
     learner.update(2, RATE, 1.0)
-    assert shard.shard.stale == 32
+    assert shard.shard.get_state()["stale"] == 32
     np.testing.assert_array_equal(shard.shard.priorities, np.ones(50))
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from actors.replay.node import ShardNode, ShardSettings
 from actors.rollout.worker import join_stats
-from actors.service.fault_policy import CallFailed, Fault, PartFailed
+from actors.service.fault_policy import CallFailed, ComponentFailed, Fault
 from actors.service.messages import SCHEMA_VERSION, BlockHeader, TransitionBlock
 from actors.service.rpc import Done, LocalCalls
 from learner.update.learner_node import LearnerNode
@@ -156,9 +156,9 @@ def losing(make_learner, make_rows):
 
 
 def test_a_shard_that_cannot_draw_ahead_is_named_before_more_is_learned(losing):
-    with pytest.raises(PartFailed) as failed:
+    with pytest.raises(ComponentFailed) as failed:
         losing.update(4, RATE)
-    assert failed.value.part.number == 1 and losing.weights().version == 4
+    assert failed.value.component.number == 1 and losing.weights().version == 4
 
 
 def test_a_shard_that_could_not_draw_ahead_is_forgotten_with_its_replacement(losing, make_learner):

@@ -9,8 +9,8 @@ from scipy import stats
 from scipy.spatial.distance import pdist
 
 from sim_core.config import WorldConfig
-from sim_core.segregation import segregated_fraction
 from sim_core.worlds import WorldBatch
+from tests.sim_core.segregation import segregated_fraction
 
 SETUPS = list(itertools.product((5, 10, 15, 20, 25), (1, 2, 3, 4, 8)))
 WORLDS = 40
