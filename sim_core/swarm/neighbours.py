@@ -71,7 +71,7 @@ def neighbour_params(
 
 @inlined
 def list_start(row, tile_index, tile, p):
-    """Index of the vector of `tile.neighbours` where a row's lists start. With a grid all tiles share the same lists."""
+    """Where a row's lists start in `tile.neighbours`, in vectors. With a grid all tiles share the same lists."""
     return ((0 if p.use_grid else tile_index) * tile.row_slots.shape[0] + row) * p.max_neighbours
 
 

@@ -117,7 +117,7 @@ def test_a_baselines_name_is_taken_and_a_run_of_that_name_is_named_as_a_folder(c
         (["r", "--preset", "best"], ["--preset", "'r' has a preset of its own"]),
         (["r", "--checkpoint", "step-7"], ["no checkpoint 'step-7'", "there are: none"]),
         (["r", "--method", "in"], ["--method", "fl-orca, greedy, random", "'r' has a method of its own"]),
-        (["greedy", "--method", "touch"], ["--method", "touch"]),
+        (["greedy", "--method", "touch"], ["method must be one of", "touch"]),
         (["greedy", "--robots", "1"], ["robots", "at least 2"]),
         (["fl-orca", "--robots", "400"], ["does not fit"]),
         (["random", "--method", "out", "--robots", "2"], ["robots", "at least 3"]),
