@@ -2,23 +2,33 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-READY := $(VENV)/.ready
+RUNTIME := $(VENV)/.runtime-ready
+READY := $(VENV)/.dev-ready
 RLLIB := $(VENV)/rllib
-INSTALL := -m pip install --quiet --disable-pip-version-check --editable
+PIP := -m pip install --quiet --disable-pip-version-check --no-compile
+INSTALL := $(PIP) --constraint .ci/constraints.txt --editable
+# Python compiles the modules that it imports, once. pip would compile all, which takes longer than a first training saves.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: train test bench bench-peers bench-exactness reproduce fuzz soak lint setup clean
+.PHONY: train test check bench bench-peers bench-exactness reproduce fuzz soak lint types kernels constraints setup clean
 
 setup: $(READY)
 
-# The environment counts as made only once everything is in it.
-$(READY): pyproject.toml
+$(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "shoal needs Python 3.11 or newer: make PYTHON=python3.11 ...")'
 	$(PYTHON) -m venv $(VENV)
+
+# An environment counts as made only once everything is in it.
+$(RUNTIME): pyproject.toml .ci/constraints.txt | $(BIN)/python
+	$(BIN)/python $(INSTALL) .
+	touch $@
+
+$(READY): pyproject.toml .ci/constraints.txt | $(BIN)/python
 	$(BIN)/python $(INSTALL) '.[dev]'
-	touch $(READY)
+	touch $(RUNTIME) $@
 
 # The main job: M_sensor, 10 robots x 2 groups, on a Ray of its own. ARGS adds flags, as in ARGS="--seed 1".
-train: $(READY)
+train: $(RUNTIME)
 	$(BIN)/shoal train $(ARGS)
 
 lint: $(READY)
@@ -30,6 +40,10 @@ lint: $(READY)
 # Lint, types, import rules, then all tests. ARGS goes to pytest.
 test: lint
 	$(BIN)/python -m pytest $(ARGS)
+
+# Renews .ci/constraints.txt: the newest releases that pyproject.toml admits. ARGS="torch==2.13.0" holds one back.
+constraints: $(BIN)/python
+	$(BIN)/python .ci/constraints.py $(ARGS)
 
 bench: $(READY)
 	$(BIN)/python -m tests.benchmarks $(ARGS)
@@ -45,7 +59,7 @@ $(VENV)/.peers: $(READY)
 
 $(RLLIB)/.ready: $(READY)
 	$(PYTHON) -m venv $(RLLIB)
-	$(RLLIB)/bin/python $(INSTALL) . 'ray[rllib]'
+	$(RLLIB)/bin/python $(PIP) --editable . 'ray[rllib]'
 	touch $@
 
 # How exact the simulator is: RVO2, float64, FL-ORCA's episodes. ARGS="--episodes 20 --scenes 800" for a short one.

@@ -22,7 +22,7 @@ from deploy.options.training import Chaos, Resume, Submit, Sweep, Train, ray_add
 from learner.config import RunConfig, from_dict  # noqa: E402
 from learner.presets import PresetName, preset_config  # noqa: E402
 from learner.ray_backend.auth import guard_ray  # noqa: E402
-from sim_core.checks import ConfigError, require  # noqa: E402
+from sim_core.checks import ConfigError, require, require_packages  # noqa: E402
 
 FAILED = 1
 BAD_INPUT = 2
@@ -154,6 +154,7 @@ def execute(command: Command) -> int:
 
         return export(command)
     if isinstance(command, Dashboard):
+        require_packages("shoal dashboard", "dashboard", "plotly")
         from deploy.commands.dashboard import dashboard
 
         return dashboard(command)

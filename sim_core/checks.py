@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import math
 import typing
 from typing import Any, Literal
@@ -16,6 +17,22 @@ def require(condition: bool, message: str) -> None:
     """Raises ConfigError with `message` unless `condition` holds."""
     if not condition:
         raise ConfigError(message)
+
+
+def require_packages(purpose: str, extra: str, *packages: str) -> None:
+    """Refuses what needs an optional dependency that is not installed.
+
+    Args:
+      purpose: what needs the packages; the sentence begins with it.
+      extra: the extra of shoal that installs them.
+      packages: names under which they are imported.
+
+    Raises:
+      ConfigError: a package is missing.
+    """
+    for name in packages:
+        found = importlib.util.find_spec(name) is not None
+        require(found, f"{purpose} needs the package {name}: install it with `pip install 'shoal[{extra}]'`")
 
 
 def check_fields(config: Any) -> None:

@@ -7,16 +7,21 @@ import itertools
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 
 from actors.evaluation.trajectory import Episode
+from sim_core.checks import require_packages
 from sim_core.config import WorldConfig
 from sim_core.render import draw_world
 
 CRF = "20"
 """x264's constant quality: 18 looks lossless, 23 is its default, larger is smaller and worse."""
+
+
+def check_video_packages() -> None:
+    """Raises ConfigError unless the packages that encode videos and render Gymnasium's environments are there."""
+    require_packages("a video", "video", "imageio_ffmpeg", "pygame")
 
 
 def episode_frames(episode: Episode, config: WorldConfig, size_px: int = 480) -> Iterator[NDArray[np.uint8]]:
@@ -48,6 +53,8 @@ def write_mp4(frames: Iterable[NDArray[np.uint8]], path: Path, frames_per_s: flo
 
 def _encode(frames: Iterable[NDArray[np.uint8]], path: Path, frames_per_s: float) -> None:
     """Writes the film at once to `path`, where a broken one stays if `frames` raises."""
+    import imageio_ffmpeg  # optional
+
     source = iter(frames)
     first = next(source, None)
     if first is None:

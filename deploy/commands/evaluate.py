@@ -16,6 +16,7 @@ from actors.policy.baselines import Baseline
 from actors.policy.network import WeightsSnapshot
 from actors.rollout.vector_env import EnvSpec
 from dashboards.figures.film_strip import episode_strip_png
+from dashboards.figures.video import check_video_packages
 from deploy.console.summary_tables import evaluation_table
 from deploy.live import watch_live
 from deploy.options.results import Evaluate, Watch
@@ -123,6 +124,8 @@ def watch(command: Watch) -> int:
     config = folder.config()
     if command.live:
         return watch_live(folder, config, command)
+    if command.format == "mp4":
+        check_video_packages()
     weights = find_policy(folder, config, command.checkpoint)
     path = command.out or folder.artifacts / f"episode-{command.seed}.{command.format}"
     path.parent.mkdir(parents=True, exist_ok=True)

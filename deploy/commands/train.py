@@ -159,7 +159,7 @@ def _run(folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Che
 
         def finish(result: RunResult, rows: list[Row]) -> None:
             display.message("logging curve, animation and policy")
-            log_artifacts(folder, config, tracker, result, rows)
+            log_artifacts(folder, config, tracker, result, rows, display.message)
 
         result = execute(folder, config, tracker, display, checkpoint, place, finish)
     if result.evaluation is None:

@@ -36,11 +36,12 @@ def _plain(estimate: Estimate, digits: int) -> tuple[str, str]:
 
 def summary_lines(folder: RunFolder, result: RunResult, tracking_uri: str, is_swarm: bool) -> list[str]:
     """What a finished run left behind, and how to look at it; lines, so that paths can be copied whole."""
+    animation = folder.artifacts / ("episode.html" if is_swarm else "episode.mp4")
     lines = {
         "trained": f"{result.env_steps:,} env steps, {result.updates:,} updates",
         "checkpoint": str(result.checkpoint or "of its end: could not be written"),
         "curve": str(folder.artifacts / "learning_curve.png"),
-        "animation": str(folder.artifacts / ("episode.html" if is_swarm else "episode.mp4")),
+        "animation": str(animation) if animation.exists() else "none",
         "MLflow UI": tracking_uri,
         "evaluate": f"shoal evaluate {shlex.quote(str(folder.path))}",
     }

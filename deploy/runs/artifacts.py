@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from actors.evaluation.evaluator import record_episode, record_frames
@@ -9,7 +10,7 @@ from actors.evaluation.trajectory import Episode, load_episodes, save_episodes
 from actors.policy.network import WeightsSnapshot
 from actors.rollout.vector_env import env_shape
 from dashboards.figures.learning_curve import CurvePoint, learning_curve_png
-from dashboards.figures.video import episode_frames, write_mp4
+from dashboards.figures.video import check_video_packages, episode_frames, write_mp4
 from dashboards.pages.player import player_html
 from deploy.runs.folders import write_text
 from learner.config import RunConfig
@@ -19,6 +20,7 @@ from learner.run_folder import RunFolder
 from learner.tracking.journal import Row
 from learner.tracking.mlflow_run import Tracker
 from learner.training.evaluation_summary import as_metrics, outcome_label, score
+from sim_core.checks import ConfigError
 from sim_core.outcomes import ENDED, Outcome
 
 EPISODES_TRIED = 10
@@ -26,8 +28,15 @@ EPISODES_TRIED = 10
 VIDEO_SIZE_PX = 480
 
 
-def log_artifacts(folder: RunFolder, config: RunConfig, tracker: Tracker, result: RunResult, rows: list[Row]) -> None:
-    """Makes all artifacts of a finished run and uploads them."""
+def log_artifacts(
+    folder: RunFolder,
+    config: RunConfig,
+    tracker: Tracker,
+    result: RunResult,
+    rows: list[Row],
+    say: Callable[[str], None],
+) -> None:
+    """Makes all artifacts of a finished run and uploads them; says so where there is no animation."""
     assert result.weights is not None and result.evaluation is not None
     folder.artifacts.mkdir(exist_ok=True)
     made = [folder.path / CONFIG, _curve(folder, config, [*rows, _last_row(result)])]
@@ -35,7 +44,11 @@ def log_artifacts(folder: RunFolder, config: RunConfig, tracker: Tracker, result
         made += _swarm_animation(folder, config, result.weights)
     else:
         path = folder.artifacts / "episode.mp4"
-        made += foreign_animation(config, result.weights, config.final_eval_first_seed, path)
+        try:
+            check_video_packages()
+            made += foreign_animation(config, result.weights, config.final_eval_first_seed, path)
+        except ConfigError as error:
+            say(f"no animation: {error}")
     for path in made:
         tracker.artifact(path)
     tracker.log_policy(result.weights, config, env_shape(config.env), score(result.evaluation))

@@ -8,7 +8,6 @@ simulator with its policy is refused.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import logging
 import shutil
@@ -25,7 +24,7 @@ from torch import nn
 
 from learner.export.ports import Port
 from learner.export.reference_states import Sensed
-from sim_core.checks import ConfigError
+from sim_core.checks import ConfigError, require_packages
 
 ONNX, PROGRAM, METADATA, GOLDEN = "policy.onnx", "policy.pt2", "policy.json", "golden.npz"
 METADATA_KEY = "shoal"
@@ -53,9 +52,7 @@ class Agreement(NamedTuple):
 
 def check_packages() -> None:
     """Raises ConfigError unless the packages for ONNX are there."""
-    missing = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ConfigError(f"shoal export needs the package {missing[0]}: install it with `pip install 'shoal[export]'`")
+    require_packages("shoal export", "export", *PACKAGES)
 
 
 def check_folder(folder: Path) -> None:

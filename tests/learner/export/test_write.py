@@ -13,7 +13,6 @@ from actors.policy.baselines import Baseline
 from actors.policy.network import QNetwork, snapshot
 from actors.rollout.vector_env import env_shape
 from learner.config import RunConfig
-from learner.export import write as export
 from learner.export.ports import bare_inputs, bare_outputs
 from learner.export.reference_states import observed_states, swarm_states
 from learner.export.robot_module import BarePolicy, make_robot, robot_class
@@ -182,7 +181,7 @@ def test_a_folder_with_other_things_is_refused(tmp_path):
 
 def test_a_missing_package_is_named(monkeypatch, tmp_path):
     real = importlib.util.find_spec
-    monkeypatch.setattr(export.importlib.util, "find_spec", lambda name: None if name == "onnxscript" else real(name))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "onnxscript" else real(name))
     with pytest.raises(ConfigError, match=r"package onnxscript: .*pip install 'shoal\[export\]'"):
         bare(RunConfig(env_id="CartPole-v1"), tmp_path / "e")
     assert not list(tmp_path.iterdir())
