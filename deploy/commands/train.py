@@ -18,12 +18,12 @@ from deploy.runs.artifacts import log_artifacts
 from deploy.runs.folders import check_lasting, check_plain_name, make_folder, new_storage, run_location
 from learner.checkpoints.checkpoint import Checkpoint, finished_names
 from learner.config import RunConfig, config_hash
+from learner.placement import Place
 from learner.run import RunResult, execute, resume_point
 from learner.run_folder import RunFolder, RunIdentity, find_run
 from learner.tracking.journal import Row
 from learner.tracking.mlflow_run import Tracker
 from learner.tracking.redaction import full_uri, public_uri
-from learner.training.cluster import Place
 from learner.training.memory_estimate import check_fits
 from learner.update.learner import learning_device
 from sim_core.checks import require

@@ -10,9 +10,9 @@ from typing import Literal
 from tyro.conf import Positional, Suppress
 
 from learner.config import RunConfig
+from learner.placement import DEADLINE_S, START_DEADLINE_S, Place
 from learner.presets import PresetName
 from learner.sweep.grid import SweepConfig
-from learner.training.cluster import DEADLINE_S, START_DEADLINE_S, Place
 from sim_core.checks import require
 
 

@@ -7,11 +7,11 @@ import ray
 from ray.cluster_utils import Cluster
 
 from deploy.chaos.checks import complaints
+from learner.placement import Place
 from learner.run import execute
 from learner.run_folder import RunFolder, RunIdentity
 from learner.tracking.fault_log import read_faults
 from learner.tracking.mlflow_run import Tracker
-from learner.training.cluster import Place
 from tests.integration.conftest import SMALL
 
 pytestmark = [
