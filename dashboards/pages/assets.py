@@ -1,4 +1,4 @@
-"""Web pages made of the files in `dashboards/web`: one self-contained document, nothing fetched from elsewhere."""
+"""Builds self-contained HTML documents from the files in `dashboards/web`; they load nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from importlib import resources
 from typing import Any
 
 OFFLINE = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data: blob:"
-"""Content security policy of a page that opens from disk: it can reach nothing."""
+"""Content security policy of a page opened from disk: it may connect to nothing."""
 SERVED = f"{OFFLINE}; connect-src 'self'"
-"""That of a page that asks the server it came from for newer data."""
+"""Content security policy of a served page: it may connect to its own server alone."""
 PLAYER_CSS = ("base.css", "player.css")
 PLAYER_JS = ("inflate.js", "player.js", "draw.js", "orca.js")
 
@@ -23,25 +23,29 @@ def asset(name: str) -> str:
 
 
 def assets(*names: str) -> str:
-    """Several files, one after the other."""
+    """The texts of several files, concatenated."""
     return "".join(asset(name) for name in names)
 
 
 def fill(template: str, fields: dict[str, str]) -> str:
-    """The file `template` with every `{{name}}` replaced, once: what is put in is not searched again."""
+    """The file `template` with every `{{name}}` replaced by its field; the fields themselves are not searched."""
     return re.sub(r"\{\{([a-z-]+)\}\}", lambda match: fields[match[1]], asset(template))
 
 
 def embedded(values: Any) -> str:
-    """JSON that may stand inside a script element."""
+    """JSON, escaped for a script element."""
     return to_json(values).replace("<", "\\u003c")
 
 
 def to_json(values: Any) -> str:
-    """Compact JSON; what JSON cannot say, such as NaN, is refused."""
+    """Compact JSON.
+
+    Raises:
+      ValueError: a number is not finite, which JSON cannot express.
+    """
     return json.dumps(values, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
 def packed(data: bytes) -> str:
-    """Bytes as `inflate.js` takes them: zlib, then base64."""
+    """Bytes in the form that `inflate.js` reads: compressed by zlib, then base64."""
     return base64.b64encode(zlib.compress(data, 9)).decode("ascii")

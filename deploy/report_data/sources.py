@@ -12,7 +12,7 @@ from actors.evaluation.statistics import rate
 from dashboards.analysis.aggregate import CELLS_PER_METHOD, Results, Setup
 from dashboards.analysis.claim_text import tally
 from dashboards.analysis.claims import judge
-from dashboards.figures.learning_curve import CurvePoint
+from dashboards.analysis.trainings import CurvePoint
 from dashboards.pages.report_page import Contents, TablePart
 from dashboards.plotly_charts.chart import FAILURES, Chart, Table
 from dashboards.plotly_charts.result_charts import NAMED, failure_causes, heatmaps, transfers

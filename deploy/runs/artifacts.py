@@ -8,7 +8,7 @@ from actors.evaluation.evaluator import record_episode, record_frames
 from actors.evaluation.trajectory import Episode, load_episodes, save_episodes
 from actors.policy.network import WeightsSnapshot
 from actors.rollout.vector_env import env_shape
-from dashboards.figures.learning_curve import CurvePoint, learning_curve_png
+from dashboards.analysis.trainings import CurvePoint, learning_curve_png
 from dashboards.figures.video import episode_frames, write_mp4
 from dashboards.pages.player import player_html
 from deploy.runs.folders import write_text

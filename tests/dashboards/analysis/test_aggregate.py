@@ -8,8 +8,8 @@ import pytest
 from actors.evaluation.statistics import Estimate, rate
 from dashboards.analysis.aggregate import (
     GROUPS,
-    Cell,
-    Measured,
+    Measurement,
+    PooledCell,
     Results,
     Setup,
     average,
@@ -28,8 +28,8 @@ from tests.dashboards.tables import claimed_table, fixed, row
 HOME = Setup(10, 2)
 
 
-def of(count: int, total: int) -> Measured:
-    return Measured(rate(count, total), total)
+def of(count: int, total: int) -> Measurement:
+    return Measurement(rate(count, total), total)
 
 
 def test_seeds_are_pooled_by_their_counts():
@@ -148,21 +148,21 @@ def test_interval_of_a_mean_covers_the_truth_as_often_as_it_says():
     assert 0.93 <= hits / 1000 <= 0.98
 
 
-def test_interval_of_lost_less_captured_knows_that_one_excludes_the_other():
+def test_interval_of_lost_minus_captured_knows_that_one_excludes_the_other():
     """Taken for independent, they would cover only 90 % here."""
     rng = np.random.default_rng(1)
     hits = 0
     for gone, taken, _ in rng.multinomial(200, [0.3, 0.3, 0.4], size=2000):
         made = row("sensor", HOME, success=0, episodes=200)._replace(lost=int(gone), captured=int(taken))
-        estimate = Cell((made,)).lost_less_captured().estimate
+        estimate = PooledCell((made,)).lost_minus_captured().estimate
         hits += estimate.low <= 0.0 <= estimate.high
     assert 0.935 <= hits / 2000 <= 0.97
 
 
-def test_lost_less_captured_without_either_or_with_nothing_else():
-    none = Cell((row("sensor", HOME, success=100),)).lost_less_captured().estimate
+def test_lost_minus_captured_without_either_or_with_nothing_else():
+    none = PooledCell((row("sensor", HOME, success=100),)).lost_minus_captured().estimate
     assert none.value == 0 and none.low == -none.high
-    only = Cell((row("sensor", HOME, success=0, lost=100),)).lost_less_captured().estimate
+    only = PooledCell((row("sensor", HOME, success=0, lost=100),)).lost_minus_captured().estimate
     assert only.value == 1 and only.low > 0.99
 
 

@@ -13,7 +13,7 @@ from plotly.colors import sample_colorscale
 from actors.evaluation.result_table import ResultRow
 from dashboards.analysis.aggregate import GROUPS, ROBOTS, Results, Setup
 from dashboards.analysis.methods import DISSERTATION, method_label
-from dashboards.figures.learning_curve import CurvePoint
+from dashboards.analysis.trainings import CurvePoint
 from dashboards.pages.assets import asset
 from dashboards.plotly_charts.chart import Chart
 from dashboards.plotly_charts.result_charts import failure_causes, heatmaps, transfers

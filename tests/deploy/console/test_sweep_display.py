@@ -3,11 +3,11 @@
 import io
 
 import pytest
+from deploy.console.sweep_board import LiveBoard, SweepBoard, make_board
 from rich.console import Console
 
 from actors.evaluation.result_table import ResultRow
 from deploy.console import sweep_board
-from deploy.console.sweep_board import LiveBoard, SweepBoard, make_board
 from learner.sweep.grid import SweepConfig, make_cells
 
 SWEEP = SweepConfig(methods=("sensor",), robots=(5,), groups=(1, 2), seeds=(0, 1), baselines=("greedy",))
