@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import html
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.evaluation.trajectory import Episode
 from dashboards.pages.assets import OFFLINE, PLAYER_CSS, PLAYER_JS, assets, embedded, fill, packed
 from sim_core.config import WorldConfig
 from sim_core.outcomes import OUTCOME_NAMES, Outcome
 from sim_core.render import GROUP_COLOURS, view_half_m
 from sim_core.scenes.base import GOAL_HALF_SIDE_M
 from sim_core.swarm.flock_rules import STATE_NAMES
+
+if TYPE_CHECKING:
+    from actors.evaluation.trajectory import Episode
 
 INT16_MAX = 32767
 SMALLEST_UNIT_M = 0.0005

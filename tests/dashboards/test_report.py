@@ -8,14 +8,15 @@ from collections.abc import Sequence
 from actors.evaluation.result_table import ResultRow
 from dashboards.analysis.aggregate import Results, Setup
 from dashboards.analysis.claims import judge
+from dashboards.analysis.comparison import baselines_of, presets_of
 from dashboards.figures.result_figures import PICTURES
-from dashboards.report import DRAWINGS, PresetPart, baselines_of, comparison, presets_of, report_markdown
+from dashboards.report import DRAWINGS, PresetSection, comparison, report_markdown
 from tests.dashboards.tables import claimed_table, fixed, row
 
 
-def part(name: str, rows: Sequence[ResultRow], folder: str = "") -> PresetPart:
+def section(name: str, rows: Sequence[ResultRow], folder: str = "") -> PresetSection:
     results = Results(rows)
-    return PresetPart(name, results, judge(results), folder, baselines_of(rows))
+    return PresetSection(name, results, judge(results), folder, baselines_of(rows))
 
 
 def test_presets_are_those_with_a_policy_and_thesis_comes_first():
@@ -26,18 +27,18 @@ def test_presets_are_those_with_a_policy_and_thesis_comes_first():
 
 def test_page_says_what_was_run():
     rows = [*claimed_table(), fixed("sensor", Setup(5, 1))._replace(seed=1, episodes=3000)]
-    page = report_markdown(["results.csv"], [part("thesis", rows)])
+    page = report_markdown(["results.csv"], [section("thesis", rows)])
     assert "`results.csv`" in page and "Presets side by side" not in page
     assert "| thesis | 75 | 10 | 1 … 2 | 258,000 |" in page
 
 
 def test_partial_tables_are_counted():
-    page = report_markdown(["half.csv"], [part("best", [fixed("out", Setup(5, 1)), fixed("in", Setup(5, 1))])])
+    page = report_markdown(["half.csv"], [section("best", [fixed("out", Setup(5, 1)), fixed("in", Setup(5, 1))])])
     assert "| best | 2 | 0 | 1 | 6,000 |" in page and "15 no data" in page
 
 
 def test_page_embeds_every_picture_with_words_for_it():
-    parts = [part("thesis", claimed_table(), "thesis/"), part("best", claimed_table(), "best/")]
+    parts = [section("thesis", claimed_table(), "thesis/"), section("best", claimed_table(), "best/")]
     links = re.findall(r"!\[([^\]]+)\]\(([^)]+)\)", report_markdown(["r.csv"], parts))
     wanted = [f"{name}/{picture.file}" for name in ("thesis", "best") for picture in PICTURES]
     assert [link for _, link in links] == wanted + [drawing.file for drawing in DRAWINGS]
@@ -70,7 +71,7 @@ def test_baselines_stand_beside_the_learned_policies_of_the_same_setups():
         row("sensor", Setup(5, 1), success=95)._replace(policy="greedy"),
         row("sensor", Setup(25, 8), success=5)._replace(policy="greedy"),
     ]
-    page = report_markdown(["r.csv"], [part("thesis", [*learned, *greedy])])
+    page = report_markdown(["r.csv"], [section("thesis", [*learned, *greedy])])
     assert "| method | setups in all | learned | greedy | learned best in | greedy best in |" in page
     assert "| M_sensor | 1 | 90.0 % | 95.0 % | 0 | 1 |" in page
-    assert "rules that learn nothing" not in report_markdown(["r.csv"], [part("thesis", learned)])
+    assert "rules that learn nothing" not in report_markdown(["r.csv"], [section("thesis", learned)])

@@ -12,7 +12,7 @@ from PIL import Image
 import dashboards
 from actors.evaluation.result_table import LEARNED, read_table
 from deploy.cli import main
-from deploy.runs.sweep_provenance import grid_of, read_sittings
+from deploy.runs.sweep_provenance import grid_of, read_provenance
 from learner.config import RunConfig, to_dict
 from learner.sweep.grid import expected_hash, make_cell, sweep_of_label
 
@@ -30,7 +30,7 @@ def test_there_are_results():
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_the_commands_that_made_the_results_are_known(folder):
-    sittings = read_sittings(folder / "results.csv")
+    sittings = read_provenance(folder / "results.csv")
     assert sittings and all(re.fullmatch("[0-9a-f]{40}", sitting.commit) for sitting in sittings)
     seeds = {row.seed for row in read_table(folder / "results.csv") if row.policy == LEARNED}
     told = [re.search(r"--seeds ([\d ]+)", sitting.command) for sitting in sittings]

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from dashboards.figures.learning_curve import FAILURE_STYLES, VALUE, CurvePoint, learning_curve_png
+from dashboards.analysis.failure_styles import FAILURE_STYLES
+from dashboards.analysis.trainings import CurvePoint
+from dashboards.figures.learning_curve import VALUE, learning_curve_png
 
 Colour = str | tuple[float, float, float]
 
@@ -59,17 +61,17 @@ def test_failures_have_a_panel_with_a_line_each(tmp_path: Path):
     plain = draw(tmp_path / "plain.png", rising(None))
     some = draw(tmp_path / "some.png", rising({"lost": 0.3, "collision": 0.1}))
     assert some.shape[0] > plain.shape[0]
-    for name, (colour, _, _) in FAILURE_STYLES.items():
+    for name, (colour, *_) in FAILURE_STYLES.items():
         if name != "timeout":
             assert (len(places(some, colour)[0]) > 50) == (name in ("lost", "collision")), name
-    lost, collision = (height_at(some, FAILURE_STYLES[name][0], 0.6) for name in ("lost", "collision"))
+    lost, collision = (height_at(some, FAILURE_STYLES[name].colour, 0.6) for name in ("lost", "collision"))
     assert lost > collision + 0.05
 
 
 def test_failures_may_be_missing_from_some_rows(tmp_path: Path):
     rows = rising(None)[:4] + rising({"captured": 0.2, "lost": 0.5})[4:]
     image = draw(tmp_path / "curve.png", rows)
-    _, columns = places(image[image.shape[0] * 2 // 3 :], FAILURE_STYLES["captured"][0])
+    _, columns = places(image[image.shape[0] * 2 // 3 :], FAILURE_STYLES["captured"].colour)
     assert columns.min() > 0.45 * image.shape[1]
 
 

@@ -14,7 +14,7 @@ from dashboards.analysis.aggregate import GROUPS, ROBOTS, Results, Setup
 from dashboards.analysis.claims import judge
 from dashboards.analysis.methods import DISSERTATION, method_label
 from dashboards.pages.player import player_data
-from dashboards.pages.report_page import Contents, EpisodeGroup, TablePart, report_data, report_page
+from dashboards.pages.report_page import EpisodeGroup, ReportContents, TableSection, report_data, report_page
 from dashboards.plotly_charts.result_charts import failure_causes, heatmaps, transfers
 from dashboards.plotly_charts.run_charts import setup_curves, sweep_speeds
 from sim_core.config import WorldConfig
@@ -34,17 +34,17 @@ GROUPS_OF = [
 ]
 
 
-def contents() -> Contents:
+def contents() -> ReportContents:
     presets = {"thesis": RESULTS}
     charts = [heatmaps(presets), transfers(presets), failure_causes(presets)]
-    return Contents(
+    return ReportContents(
         title=EVIL,
         subtitle="made up",
         made="by a test",
         facts=[("cells", "75 of 75")],
         charts=[*charts, setup_curves(TRAININGS), sweep_speeds(TRAININGS)],
         claims={"thesis": CLAIMS},
-        tables=[TablePart("running", "Cells under way", "", setup_curves(TRAININGS).views["5r×1g"].table)],
+        tables=[TableSection("running", "Cells under way", "", setup_curves(TRAININGS).views["5r×1g"].table)],
         groups=GROUPS_OF,
         episodes_note="some episodes",
     )

@@ -13,11 +13,11 @@ from plotly.colors import sample_colorscale
 from actors.evaluation.result_table import ResultRow
 from dashboards.analysis.aggregate import GROUPS, ROBOTS, Results, Setup
 from dashboards.analysis.methods import DISSERTATION, method_label
-from dashboards.analysis.trainings import CurvePoint
+from dashboards.analysis.trainings import CurvePoint, Speed, Training
 from dashboards.pages.assets import asset
 from dashboards.plotly_charts.chart import Chart
 from dashboards.plotly_charts.result_charts import failure_causes, heatmaps, transfers
-from dashboards.plotly_charts.run_charts import Speed, Training, run_curves, run_speeds, setup_curves, sweep_speeds
+from dashboards.plotly_charts.run_charts import run_curves, run_speeds, setup_curves, sweep_speeds
 from tests.dashboards.tables import claimed_table, row
 
 ROWS = claimed_table(without=[row("out", Setup(15, 8), success=0)])

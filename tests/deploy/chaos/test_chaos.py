@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from deploy.chaos.config import write_config
+from deploy.chaos.faults import FULL, KINDS, MLFLOW, FaultKind, InjectedFault, fault_table, with_recovery
 from deploy.chaos.processes import fill_disk
-from deploy.chaos.run import FULL, KINDS, MLFLOW, Injected, Kind, table, with_recovery
 from deploy.cli import main, read_config_file
 from learner.tracking.fault_log import DRIVER, FaultEntry
 
@@ -20,7 +20,7 @@ def entry(time_s, event, part):
 
 
 def fault(what, victim, time_s):
-    return Injected(Kind(what, victim, 1), time_s)
+    return InjectedFault(FaultKind(what, victim, 1), time_s)
 
 
 def recoveries(faults, log):
@@ -61,7 +61,7 @@ def test_what_never_recovered_has_no_time_and_neither_have_delays():
 def test_the_table_counts_faults_and_gives_median_and_maximum():
     faults = [fault("killed", "learner", 0.0)._replace(recovery_s=seconds) for seconds in (1.0, 9.0, 2.0)]
     console = Console(width=100, record=True, file=io.StringIO())
-    console.print(table([*faults, fault("delayed", "learner", 0.0)]))
+    console.print(fault_table([*faults, fault("delayed", "learner", 0.0)]))
     rows = [
         [cell.strip() for cell in line.split("│")[1:-1]] for line in console.export_text().splitlines() if "│" in line
     ]
@@ -69,9 +69,9 @@ def test_the_table_counts_faults_and_gives_median_and_maximum():
 
 
 def test_every_process_of_a_run_is_among_the_victims():
-    killed = {kind.victim for kind in KINDS if kind.what == "killed"}
+    killed = {kind.victim for kind in KINDS if kind.action == "killed"}
     assert killed == {"rollout worker", "replay shard", "evaluation", "learner", DRIVER, MLFLOW}
-    assert {kind.victim for kind in KINDS if kind.what == FULL} == {"rollout worker", "replay shard", "learner"}
+    assert {kind.victim for kind in KINDS if kind.action == FULL} == {"rollout worker", "replay shard", "learner"}
 
 
 WRITER = """

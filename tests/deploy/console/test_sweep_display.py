@@ -3,11 +3,11 @@
 import io
 
 import pytest
-from deploy.console.sweep_board import LiveBoard, SweepBoard, make_board
 from rich.console import Console
 
 from actors.evaluation.result_table import ResultRow
-from deploy.console import sweep_board
+from deploy.console import sweep_display
+from deploy.console.sweep_display import LiveSweepDisplay, SweepDisplay, make_sweep_display
 from learner.sweep.grid import SweepConfig, make_cells
 
 SWEEP = SweepConfig(methods=("sensor",), robots=(5,), groups=(1, 2), seeds=(0, 1), baselines=("greedy",))
@@ -22,7 +22,7 @@ def rows(goal, episodes=100):
     ]
 
 
-def board_of(done=None, kind=SweepBoard):
+def board_of(done=None, kind=SweepDisplay):
     console = Console(file=io.StringIO(), width=120)
     return kind(console, CELLS, done or {}), console
 
@@ -40,7 +40,7 @@ def line_of(board, label):
 @pytest.fixture
 def clock(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(sweep_board.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(sweep_display.time, "monotonic", lambda: now[0])
     return now
 
 
@@ -82,10 +82,10 @@ def test_a_log_gets_a_line_a_cell_and_a_terminal_the_table():
     board, console = board_of()
     board.finished(NAMES["sensor 5r×1g s0"], rows(55))
     assert "sensor 5r×1g s0: success 55.0%" in console.file.getvalue()
-    live, terminal = board_of(kind=LiveBoard)
+    live, terminal = board_of(kind=LiveSweepDisplay)
     live.finished(NAMES["sensor 5r×1g s0"], rows(55))
     assert terminal.file.getvalue() == ""
     with live:
         pass
-    assert type(make_board(Console(file=io.StringIO()), CELLS, {})) is SweepBoard
-    assert type(make_board(Console(file=io.StringIO(), force_terminal=True), CELLS, {})) is LiveBoard
+    assert type(make_sweep_display(Console(file=io.StringIO()), CELLS, {})) is SweepDisplay
+    assert type(make_sweep_display(Console(file=io.StringIO(), force_terminal=True), CELLS, {})) is LiveSweepDisplay

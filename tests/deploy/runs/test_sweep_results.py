@@ -9,9 +9,9 @@ import pytest
 
 from actors.evaluation.result_table import LEARNED, ResultRow, read_table, write_table
 from deploy.cli import parse
-from deploy.commands.sweep import SweepResults
 from deploy.options.training import Sweep
-from deploy.runs.sweep_provenance import read_sittings, sweep_command
+from deploy.runs.sweep_provenance import read_provenance, sweep_command
+from deploy.runs.sweep_results import SweepResults
 from learner.sweep.grid import SweepConfig, cell_hash, make_cells
 from sim_core.checks import ConfigError
 
@@ -53,17 +53,17 @@ def test_the_command_of_a_sitting_asks_for_the_same_grid(grid: SweepConfig):
 
 def test_sittings_are_kept_and_come_with_known_results(tmp_path: Path):
     first = SweepResults(GRID, tmp_path / "first")
-    first.begin_sitting()
+    first.record_provenance()
     write_table(first.table, [row_of(GRID)])
-    before = read_sittings(tmp_path / "first" / "results.csv")
+    before = read_provenance(tmp_path / "first" / "results.csv")
     assert [sitting.command for sitting in before] == [sweep_command(GRID)]
 
     more = SweepConfig(methods=("in",), seeds=(0,))
     for _ in range(2):  # the same command again, to go on, is the same sitting
         later = SweepResults(more, tmp_path / "later", tmp_path / "first" / "results.csv")
-        later.begin_sitting()
+        later.record_provenance()
         later.write()
-    known = read_sittings(tmp_path / "later" / "results.csv")
+    known = read_provenance(tmp_path / "later" / "results.csv")
     assert [sitting.command for sitting in known] == [sweep_command(GRID), sweep_command(more)]
 
 
@@ -71,24 +71,24 @@ def test_the_one_sitting_that_older_files_tell_of_is_kept(tmp_path: Path):
     older = {"sweep": dataclasses.asdict(GRID), "commit": "a1d63ee"}
     (tmp_path / "settings.json").write_text(json.dumps(older))
     SweepResults(GRID, tmp_path).write()
-    assert read_sittings(tmp_path / "results.csv") == [(sweep_command(GRID), "a1d63ee")]
+    assert read_provenance(tmp_path / "results.csv") == [(sweep_command(GRID), "a1d63ee")]
 
 
 def test_known_results_of_other_settings_are_left_out_and_their_sittings_too(tmp_path: Path):
     other = dataclasses.replace(GRID, env_steps=250_000)
     first = SweepResults(other, tmp_path / "first")
-    first.begin_sitting()
+    first.record_provenance()
     write_table(tmp_path / "first" / "results.csv", [row_of(other)])
     later = SweepResults(GRID, tmp_path / "later", tmp_path / "first" / "results.csv")
     later.write()
     assert later.left_out == 1 and not read_table(tmp_path / "later" / "results.csv")
-    assert read_sittings(tmp_path / "later" / "results.csv") == []
+    assert read_provenance(tmp_path / "later" / "results.csv") == []
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"sittings": [1]}', '{"sittings": {"command": "x"}}'])
 def test_a_file_that_tells_nothing_tells_of_no_sitting(text: str, tmp_path: Path):
     (tmp_path / "settings.json").write_text(text)
-    assert read_sittings(tmp_path / "results.csv") == []
+    assert read_provenance(tmp_path / "results.csv") == []
 
 
 @pytest.mark.parametrize(
