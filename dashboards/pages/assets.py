@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import base64
+import html
 import json
 import re
 import zlib
+from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
@@ -14,7 +16,7 @@ OFFLINE = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inl
 SERVED = f"{OFFLINE}; connect-src 'self'"
 """Content security policy of a served page: it may connect to its own server alone."""
 PLAYER_CSS = ("base.css", "player.css")
-PLAYER_JS = ("inflate.js", "player.js", "draw.js", "orca.js")
+PLAYER_JS = ("dom.js", "inflate.js", "player.js", "draw.js", "orca.js")
 
 
 def asset(name: str) -> str:
@@ -27,9 +29,24 @@ def assets(*names: str) -> str:
     return "".join(asset(name) for name in names)
 
 
-def fill(template: str, fields: dict[str, str]) -> str:
+def document(title: str, policy: str, css: Sequence[str], body: str, **fields: str) -> str:
+    """An HTML document.
+
+    Args:
+      title: plain text; it is escaped.
+      policy: content security policy.
+      css: files of its style.
+      body: file of its body, a template.
+      **fields: HTML of the body's fields, beside `title`.
+    """
+    escaped = html.escape(title)
+    content = _filled(body, title=escaped, **fields)
+    return _filled("document.html", title=escaped, policy=html.escape(policy), css=assets(*css), body=content)
+
+
+def _filled(template: str, **fields: str) -> str:
     """The file `template` with every `{{name}}` replaced by its field; the fields themselves are not searched."""
-    return re.sub(r"\{\{([a-z-]+)\}\}", lambda match: fields[match[1]], asset(template))
+    return re.sub(r"\{\{([a-z]+)\}\}", lambda match: fields[match[1]], asset(template))
 
 
 def embedded(values: Any) -> str:

@@ -6,14 +6,13 @@ states in units of half a millimetre or more. Velocities are not stored: they ar
 
 from __future__ import annotations
 
-import html
 import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dashboards.pages.assets import OFFLINE, PLAYER_CSS, PLAYER_JS, assets, embedded, fill, packed
+from dashboards.pages.assets import OFFLINE, PLAYER_CSS, PLAYER_JS, assets, document, embedded, packed
 from sim_core.config import WorldConfig
 from sim_core.outcomes import OUTCOME_NAMES, Outcome
 from sim_core.render import GROUP_COLOURS, view_half_m
@@ -63,15 +62,15 @@ def player_page(title: str, data: dict[str, Any], script: str, policy: str) -> s
       script: name of the script's file in `dashboards/web`.
       policy: content security policy.
     """
-    fields = {
-        "title": html.escape(title),
-        "policy": html.escape(policy),
-        "css": assets(*PLAYER_CSS),
-        "stage": assets("stage.html"),
-        "js": assets(*PLAYER_JS, script),
-        "data": embedded(data),
-    }
-    return fill("player.html", fields)
+    return document(
+        title,
+        policy,
+        (*PLAYER_CSS, "player_page.css"),
+        "player.html",
+        stage=assets("stage.html"),
+        data=embedded(data),
+        js=assets(*PLAYER_JS, script),
+    )
 
 
 def player_data(episode: Episode, config: WorldConfig) -> dict[str, Any]:

@@ -8,14 +8,23 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import html
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from dashboards.analysis.claim_checks import Claim
 from dashboards.analysis.claim_text import DETAILS, NOTE, detail_row, evidence, tally
 from dashboards.analysis.methods import in_order, method_label
-from dashboards.pages.assets import OFFLINE, PLAYER_CSS, PLAYER_JS, SERVED, assets, embedded, fill, packed, to_json
+from dashboards.pages.assets import (
+    OFFLINE,
+    PLAYER_CSS,
+    PLAYER_JS,
+    SERVED,
+    assets,
+    document,
+    embedded,
+    packed,
+    to_json,
+)
 from dashboards.plotly_charts.chart import Chart, Table, as_json, plotly_js
 from dashboards.plotly_charts.result_charts import FAVOURITE
 
@@ -112,18 +121,18 @@ def report_page(title: str, data: Mapping[str, Any], samples: Mapping[str, Any],
         from 0.
       live: whether the page is served, and requests newer data and episodes; otherwise it may connect to nothing.
     """
-    fields = {
-        "title": html.escape(title),
-        "policy": html.escape(SERVED if live else OFFLINE),
-        "refresh": str(REFRESH_S if live else 0),
-        "css": assets(*PLAYER_CSS, "report.css"),
-        "stage": assets("stage.html"),
-        "plotly": _plotly(),
-        "data": packed(to_json(data).encode()),
-        "samples": embedded(samples),
-        "js": assets(*PLAYER_JS, "charts.js", "report.js", "episodes.js"),
-    }
-    return fill("report.html", fields)
+    return document(
+        title,
+        SERVED if live else OFFLINE,
+        (*PLAYER_CSS, "report.css"),
+        "report.html",
+        refresh=str(REFRESH_S if live else 0),
+        stage=assets("stage.html"),
+        plotly=_plotly(),
+        data=packed(to_json(data).encode()),
+        samples=embedded(samples),
+        js=assets(*PLAYER_JS, "charts.js", "report.js", "episodes.js"),
+    )
 
 
 @functools.cache

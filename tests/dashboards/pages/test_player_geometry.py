@@ -132,4 +132,4 @@ def test_a_click_on_a_robot_shows_its_lines(page: Any, episode: Episode):
     page.execute_script(
         "element('robot').value = arguments[0]; element('robot').dispatchEvent(new Event('input'))", episode.learner + 1
     )
-    assert "obeys its policy" in page.execute_script("return element('planes-text').textContent")
+    assert "follows its policy" in page.execute_script("return element('planes-text').textContent")
