@@ -1,4 +1,4 @@
-"""What `shoal submit` hands to the cluster: the same command, with a name and a folder that outlast the job."""
+"""The job of `shoal submit`: the given command, with a name and a folder that outlast the job."""
 
 from pathlib import Path
 
@@ -17,14 +17,14 @@ def submitted(*arguments: str):
     return command, command.job
 
 
-def test_options_stand_before_the_command_and_its_own_after_it():
+def test_options_of_submit_come_before_the_job_and_the_jobs_own_after_it():
     command, job = submitted("--address", "head:8265", "--stop-wait-s", "9", "train", "--robots", "5", "--address=x")
     assert (command.address, command.stop_wait_s) == ("head:8265", 9)
     assert command.arguments == ("train", "--robots", "5", "--address=x")
     assert (job.run.world.robots, job.launch.address) == (5, "x")
 
 
-def test_the_job_runs_what_was_asked_for_in_a_folder_that_lasts(monkeypatch, tmp_path):
+def test_the_job_runs_the_given_command_in_a_folder_that_outlasts_it(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     command, job = submitted("train", "--robots", "5", "--runs-dir", "here", "--seed", "3")
     words = job_arguments(command.arguments, job)
@@ -35,7 +35,7 @@ def test_the_job_runs_what_was_asked_for_in_a_folder_that_lasts(monkeypatch, tmp
     assert there.or_resume and there.launch.name == run_name(job)
 
 
-def test_the_same_settings_have_the_same_name_and_others_another():
+def test_a_jobs_name_is_decided_by_its_settings():
     names = {}
     for arguments in ("", "--robots 10", "--total-env-steps 9000000", "--robots 5", "--seed 1", "--learning-rate 0.1"):
         command, job = submitted("train", *arguments.split())
@@ -48,7 +48,7 @@ def test_the_same_settings_have_the_same_name_and_others_another():
     assert config_hash(job.run) in names[""]
 
 
-def test_a_sweep_keeps_its_own_name_and_goes_on_by_itself(tmp_path):
+def test_a_sweep_keeps_its_default_name_and_needs_no_or_resume(tmp_path):
     command, job = submitted("sweep", "--preset", "best", "--set", "n_step=2", "--runs-dir", str(tmp_path))
     assert job_name(command.arguments, job) == "shoal-sweep-best-n_step-2"
     there = parse(job_arguments(command.arguments, job))

@@ -1,4 +1,4 @@
-"""The board of a sweep: what stands in its cells, and how long it says the rest will take."""
+"""The display of a sweep: the entries of its table, and its estimate of the time left."""
 
 import io
 
@@ -22,19 +22,19 @@ def rows(goal, episodes=100):
     ]
 
 
-def board_of(done=None, kind=SweepDisplay):
+def display_of(done=None, kind=SweepDisplay):
     console = Console(file=io.StringIO(), width=120)
     return kind(console, CELLS, done or {}), console
 
 
-def text_of(board):
+def text_of(display):
     console = Console(file=io.StringIO(), width=120)
-    console.print(board.table())
+    console.print(display.table())
     return console.file.getvalue()
 
 
-def line_of(board, label):
-    return next(line for line in text_of(board).splitlines() if label in line)
+def line_of(display, label):
+    return next(line for line in text_of(display).splitlines() if label in line)
 
 
 @pytest.fixture
@@ -44,45 +44,45 @@ def clock(monkeypatch):
     return now
 
 
-def test_a_cell_shows_the_mean_of_its_seeds_and_what_is_missing():
-    board, _ = board_of({NAMES["sensor 5r×1g s0"]: rows(90)})
-    assert "90.0% (1/2)" in line_of(board, "│ sensor")
-    board.finished(NAMES["sensor 5r×1g s1"], rows(70))
-    assert "80.0%" in line_of(board, "│ sensor") and "(1/2)" not in line_of(board, "│ sensor")
-    assert line_of(board, "greedy, sensor").count("·") == 2
+def test_an_entry_shows_the_mean_over_seeds_and_how_many_are_missing():
+    display, _ = display_of({NAMES["sensor 5r×1g s0"]: rows(90)})
+    assert "90.0% (1/2)" in line_of(display, "│ sensor")
+    display.finished(NAMES["sensor 5r×1g s1"], rows(70))
+    assert "80.0%" in line_of(display, "│ sensor") and "(1/2)" not in line_of(display, "│ sensor")
+    assert line_of(display, "greedy, sensor").count("·") == 2
 
 
-def test_a_running_cell_shows_how_far_it_is_and_a_failed_one_says_so():
-    board, console = board_of()
+def test_running_and_failed_cells_are_shown():
+    display, console = display_of()
     key = NAMES["sensor 5r×2g s0"]
-    board.started(key)
-    board.progressed(key, CELLS[-1].config.total_env_steps // 2)
-    assert "▸45%" in line_of(board, "│ sensor")
-    board.failed(key, "OutOfMemoryError")
-    assert "failed" in line_of(board, "│ sensor") and "▸" not in text_of(board)
-    assert board.failures() == ["sensor 5r×2g s0: OutOfMemoryError"]
-    assert "1 failed" in board.summary() and "OutOfMemoryError" in console.file.getvalue()
-    board.started(key)
-    assert not board.failures()
+    display.started(key)
+    display.progressed(key, CELLS[-1].config.total_env_steps // 2)
+    assert "▸45%" in line_of(display, "│ sensor")
+    display.failed(key, "OutOfMemoryError")
+    assert "failed" in line_of(display, "│ sensor") and "▸" not in text_of(display)
+    assert display.failures() == ["sensor 5r×2g s0: OutOfMemoryError"]
+    assert "1 failed" in display.summary() and "OutOfMemoryError" in console.file.getvalue()
+    display.started(key)
+    assert not display.failures()
 
 
-def test_the_time_left_goes_by_the_weight_of_what_is_done_since_the_start(clock):
+def test_the_time_left_is_estimated_from_the_weight_done_since_the_start(clock):
     first = NAMES["sensor 5r×1g s0"]
-    board, _ = board_of({first: rows(90)})
-    assert board.left_s() is None and "left" not in board.summary()
+    display, _ = display_of({first: rows(90)})
+    assert display.left_s() is None and "left" not in display.summary()
     weights = {cell.key: cell.weight for cell in CELLS}
     clock[0] += 60.0
-    board.finished(NAMES["sensor 5r×1g s1"], rows(90))
+    display.finished(NAMES["sensor 5r×1g s1"], rows(90))
     left = sum(weights.values()) - weights[first] - weights[NAMES["sensor 5r×1g s1"]]
-    assert board.left_s() == pytest.approx(60.0 * left / weights[NAMES["sensor 5r×1g s1"]])
-    assert f"[2 of {len(CELLS)} cells, 0 running" in board.summary()
+    assert display.left_s() == pytest.approx(60.0 * left / weights[NAMES["sensor 5r×1g s1"]])
+    assert f"[2 of {len(CELLS)} cells, 0 running" in display.summary()
 
 
-def test_a_log_gets_a_line_a_cell_and_a_terminal_the_table():
-    board, console = board_of()
-    board.finished(NAMES["sensor 5r×1g s0"], rows(55))
+def test_a_log_gets_one_line_per_cell_and_a_terminal_the_table():
+    display, console = display_of()
+    display.finished(NAMES["sensor 5r×1g s0"], rows(55))
     assert "sensor 5r×1g s0: success 55.0%" in console.file.getvalue()
-    live, terminal = board_of(kind=LiveSweepDisplay)
+    live, terminal = display_of(kind=LiveSweepDisplay)
     live.finished(NAMES["sensor 5r×1g s0"], rows(55))
     assert terminal.file.getvalue() == ""
     with live:

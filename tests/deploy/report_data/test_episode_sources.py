@@ -1,4 +1,4 @@
-"""Episodes to choose from: which travel with a file, and where recorded ones come from."""
+"""Which episodes a file embeds, and how recorded episodes are found."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sim_core.outcomes import Outcome
 
 
 class MadeUpEpisodes:
-    """Episodes of equal size that say which they are."""
+    """Episodes of equal size that hold their own key."""
 
     def __init__(self, *groups: EpisodeGroup) -> None:
         self._groups = list(groups)
@@ -37,7 +37,7 @@ FIRST, SECOND = group("a", goal=9, lost=1), group("b", goal=1, captured=5, lost=
 ELSEWHERE = group("c", played="10r×1g", goal=9)
 
 
-def test_the_frequent_travels_first_and_extrapolations_do_not():
+def test_frequent_outcomes_are_embedded_first_and_extrapolations_are_not():
     source = MadeUpEpisodes(FIRST, SECOND, ELSEWHERE)
     chosen = embedded_episodes(source, source.groups(), each=2, limit_bytes=1e6)
     assert list(chosen) == [
@@ -47,7 +47,7 @@ def test_the_frequent_travels_first_and_extrapolations_do_not():
     assert all(value == {"is": key} for key, value in chosen.items())
 
 
-def test_the_limit_holds():
+def test_the_size_limit_holds():
     source = MadeUpEpisodes(FIRST, SECOND)
     first, second = (len(f'{{"is":"{key}"}}') for key in ("a|goal|0", "b|captured|0"))
     assert list(embedded_episodes(source, source.groups(), 1, first + second)) == ["a|goal|0", "b|captured|0"]
