@@ -15,7 +15,7 @@ from dashboards.figures.example_episodes import EXAMPLES
 from dashboards.figures.result_figures import PICTURES
 
 DRAWINGS = (*EXAMPLES, *DIAGRAMS)
-"""Figures drawn from simulated worlds, beside those of results."""
+"""Figures drawn from simulated worlds, in addition to those of results."""
 
 
 class PresetSection(NamedTuple):

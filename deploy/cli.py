@@ -83,7 +83,7 @@ def _train_defaults(arguments: Sequence[str]) -> Train:
     """The defaults of `shoal train`, or the values of its `--config` or `--preset`.
 
     Raises:
-      ConfigError: the config file is refused, or a preset is named beside it.
+      ConfigError: the config file is refused, or a preset is named, too.
     """
     path, preset, method = (_value_of(flag, arguments) for flag in ("--config", "--preset", "--method"))
     if path is not None:
@@ -126,7 +126,7 @@ def _annotated(options: type[Command], subcommand: Any) -> Any:
 
 
 def _split_job(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The arguments of `shoal submit`, and apart from them its job's; for other commands, all arguments and none."""
+    """Splits the arguments of `shoal submit` into its own and its job's; other commands have no job."""
     words = list(arguments)
     begin = next((i for i, word in enumerate(words) if word in JOBS), len(words)) if words[:1] == ["submit"] else None
     return words[:begin], [] if begin is None else words[begin:]

@@ -2,7 +2,7 @@
 
 Rates have Wilson intervals on the pooled counts. Counts of different training seeds vary far more than those of one
 policy's episodes. Where a rate pools several seeds, its interval is therefore widened to hold what another seed would
-give. The factor is estimated for each outcome over the cells of one method and robot count, apart for Fixed and
+give. The factor is estimated for each outcome over the cells of one method and robot count, separately for Fixed and
 Extrapolation.
 
 The estimate takes variances over seeds as proportional to p(1 - p). Success in the setup of the training follows this.

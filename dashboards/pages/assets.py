@@ -37,7 +37,7 @@ def document(title: str, policy: str, css: Sequence[str], body: str, **fields: s
       policy: content security policy.
       css: files of its style.
       body: file of its body, a template.
-      **fields: HTML of the body's fields, beside `title`.
+      **fields: HTML of the body's fields, in addition to `title`.
     """
     escaped = html.escape(title)
     content = _filled(body, title=escaped, **fields)

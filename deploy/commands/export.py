@@ -86,7 +86,7 @@ def _exportable(command: Export, config: RunConfig, weights: WeightsSnapshot) ->
 
 
 def metadata(config: RunConfig, weights: WeightsSnapshot, bare: bool) -> dict[str, Any]:
-    """The metadata of an exported file, beside its inputs and outputs."""
+    """The metadata of an exported file, in addition to its inputs and outputs."""
     world = config.world
     robot = {} if bare else {"method": world.method_name, "setup": world.setup, "frame": FRAME}
     timing = {} if bare else {"time_step_s": world.time_step_s, "outer_radius_m": world.outer_radius_m}

@@ -60,7 +60,7 @@ def run(command: Submit) -> int:
     working_dir = command.working_dir.absolute()
     require(
         (working_dir / "deploy" / "cli.py").is_file(),
-        f"--working-dir {working_dir} is no checkout of shoal, which the job is to run; name one",
+        f"--working-dir {working_dir} is not a checkout of shoal, which the job runs; name one",
     )
     _check_launch(command.job.launch)
     server = JobServer(command.address)

@@ -42,7 +42,7 @@ def run(command: Train) -> int:
         check_plain_name(launch.name)
         require(launch.name not in list(Baseline), f"--name {launch.name} is that of a baseline; choose another")
     if command.or_resume:
-        require(launch.name is not None, "--or-resume needs --name, the run to go on with")
+        require(launch.name is not None, "--or-resume needs --name, the run to resume")
     folder = _run_folder(config, launch, command.or_resume)
     if folder.has_begun():
         with folder.hold():

@@ -77,7 +77,7 @@ class Train:
     """Train one setup from the start."""
 
     config: Path | None = None
-    """TOML file with settings; flags override it. World settings stand under [world]."""
+    """TOML file with settings; flags override it. World settings are under [world]."""
     preset: PresetName | None = None
     """Named settings of --method in place of the defaults, those of `shoal sweep`; flags override them."""
     or_resume: bool = False

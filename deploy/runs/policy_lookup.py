@@ -15,7 +15,7 @@ from learner.tracking.journal import read_rows
 from sim_core.checks import ConfigError
 
 NEWEST, BEST = "newest", "best"
-"""Selections of a checkpoint, beside a checkpoint's name."""
+"""Selections of a checkpoint; any other value is a checkpoint's name."""
 
 
 def find_policy(folder: RunFolder, config: RunConfig, which: str = NEWEST) -> WeightsSnapshot:

@@ -63,7 +63,7 @@ def test_a_sweep_keeps_its_default_name_and_needs_no_or_resume(tmp_path):
         ([], "train or sweep"),
         (["--stop-wait-s", "0", "train"], "--stop-wait-s"),
         (["train", "--robots", "1"], "robots"),
-        (["--working-dir", "/", "train"], "--working-dir / is no checkout"),
+        (["--working-dir", "/", "train"], "--working-dir / is not a checkout"),
         (["train", "--address", "1.2.3.4:5"], "submit --address"),
     ],
 )
