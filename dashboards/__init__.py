@@ -1,1 +1,1 @@
-"""What people look at: curves, strips, videos and the episode player, from results alone."""
+"""Figures, charts, claims and pages, made from results alone."""

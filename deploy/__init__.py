@@ -1,1 +1,1 @@
-"""The command line and what it puts together."""
+"""The command line: options, commands, and what they write and show."""

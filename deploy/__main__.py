@@ -1,4 +1,4 @@
-"""`python -m deploy` is `shoal`."""
+"""`python -m deploy` runs `shoal`."""
 
 import sys
 

@@ -1,9 +1,16 @@
-"""The command `shoal`: parses arguments, calls a command, and turns errors into one sentence and exit code 2."""
+"""The command `shoal`: parses arguments, runs a command, and turns expected errors into one sentence and an exit code.
+
+Options are dataclasses in `deploy.options`. The command NAME is run by `deploy.commands.NAME`, which is imported only
+when it runs, so that help and refused arguments need not wait for Ray, torch or MLflow.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import errno
+import functools
+import importlib
+import operator
 import os
 import sys
 import tomllib
@@ -12,7 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, cast, get_args
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")  # before numpy: one thread a process, or processes fight for cores
+    os.environ.setdefault(_name, "1")  # before numpy is imported: with more, processes compete for cores
 
 import tyro  # noqa: E402
 
@@ -27,18 +34,31 @@ from sim_core.checks import ConfigError, require, require_packages  # noqa: E402
 FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
-Command = Train | Sweep | Report | Resume | Evaluate | Watch | Dashboard | Chaos | Export | Submit
+Command = Train | Sweep | Report | Resume | Evaluate | Watch | Chaos | Export | Submit | Dashboard
+COMMANDS: dict[type[Command], str] = {
+    Train: "train",
+    Sweep: "sweep",
+    Report: "report",
+    Resume: "resume",
+    Evaluate: "evaluate",
+    Watch: "watch",
+    Chaos: "chaos",
+    Export: "export",
+    Submit: "submit",
+    Dashboard: "dashboard",
+}
+"""Every command's name, by its options, in the order of the help text."""
 JOBS = ("train", "sweep")
-"""What `shoal submit` runs."""
-BAD_NAMES = (errno.ENAMETOOLONG, errno.EILSEQ, errno.ELOOP)
-"""Errors of paths that no file can have, wherever a command first looks at them."""
+"""Commands that `shoal submit` can run."""
+BAD_PATH_ERRORS = (errno.ENAMETOOLONG, errno.EILSEQ, errno.ELOOP)
+"""Errors of paths that no file can have. A command may meet them wherever it first opens the path."""
 
 
 def read_config_file(path: Path) -> RunConfig:
-    """The config of a TOML file.
+    """Reads a config from a TOML file.
 
     Raises:
-      ConfigError: the file cannot be read, is no TOML, or holds an unknown key or a value that cannot work.
+      ConfigError: the file cannot be read, is not valid TOML, or holds an unknown key or an impossible value.
     """
     try:
         values = tomllib.loads(path.read_text("utf-8"))
@@ -50,7 +70,7 @@ def read_config_file(path: Path) -> RunConfig:
 
 
 def _value_of(flag: str, arguments: Sequence[str]) -> str | None:
-    """What follows `flag`, for flags that are needed before the rest is parsed."""
+    """The value of `flag`, for flags that are needed before the rest is parsed."""
     for i, argument in enumerate(arguments):
         if argument == flag and i + 1 < len(arguments):
             return arguments[i + 1]
@@ -60,10 +80,10 @@ def _value_of(flag: str, arguments: Sequence[str]) -> str | None:
 
 
 def _train_defaults(arguments: Sequence[str]) -> Train:
-    """What `shoal train` starts from: the defaults, or the values of a `--config` or a `--preset`.
+    """The defaults of `shoal train`, or the values of its `--config` or `--preset`.
 
     Raises:
-      ConfigError: the config's file cannot be read or holds what cannot work, or a preset is named beside it.
+      ConfigError: the config file is refused, or a preset is named, too.
     """
     path, preset, method = (_value_of(flag, arguments) for flag in ("--config", "--preset", "--method"))
     if path is not None:
@@ -75,50 +95,45 @@ def _train_defaults(arguments: Sequence[str]) -> Train:
 
 
 def parse(arguments: Sequence[str]) -> Command:
-    """The command that the arguments name.
+    """Parses a command line, without the word `shoal`.
 
     Raises:
-      ConfigError: a value cannot work.
+      ConfigError: a value is impossible.
       SystemExit: help was asked for (0), or a flag is unknown or malformed (2, after a message).
     """
-    arguments, job = _without_job(arguments)
-    default = _train_defaults(arguments) if arguments and arguments[0] == "train" else Train()
-    commands: Any = (
-        Annotated[Train, tyro.conf.subcommand("train", default=default)]
-        | Annotated[Sweep, tyro.conf.subcommand("sweep")]
-        | Annotated[Report, tyro.conf.subcommand("report")]
-        | Annotated[Resume, tyro.conf.subcommand("resume")]
-        | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-        | Annotated[Watch, tyro.conf.subcommand("watch")]
-        | Annotated[Chaos, tyro.conf.subcommand("chaos")]
-        | Annotated[Export, tyro.conf.subcommand("export")]
-        | Annotated[Submit, tyro.conf.subcommand("submit")]
-        | Annotated[Dashboard, tyro.conf.subcommand("dashboard")]
-    )
-    options = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagConversionOff)
+    arguments, job = _split_job(arguments)
+    train = _train_defaults(arguments) if arguments and arguments[0] == "train" else Train()
+    subcommands = [
+        tyro.conf.subcommand(name, default=train) if options is Train else tyro.conf.subcommand(name)
+        for options, name in COMMANDS.items()
+    ]
+    union: Any = functools.reduce(operator.or_, map(_annotated, COMMANDS, subcommands))
     command: Command = tyro.cli(
-        commands,
+        union,
         prog="shoal",
         args=list(arguments),
-        config=options,
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagConversionOff),
         description="Teach one robot to move with its swarm.",
     )
     if isinstance(command, Submit):
         require(bool(job), f"`shoal submit` needs a command to run: {' or '.join(JOBS)}, with its arguments")
-        command = dataclasses.replace(command, command=tuple(job))
-        parse(job)  # refuses here what the job would refuse
+        return dataclasses.replace(command, arguments=tuple(job), job=cast("Train | Sweep", parse(job)))
     return command
 
 
-def _without_job(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The arguments of `shoal submit` and, apart, the command that it is to run; of other commands all and none."""
+def _annotated(options: type[Command], subcommand: Any) -> Any:
+    return Annotated[options, subcommand]
+
+
+def _split_job(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Splits the arguments of `shoal submit` into its own and its job's; other commands have no job."""
     words = list(arguments)
     begin = next((i for i, word in enumerate(words) if word in JOBS), len(words)) if words[:1] == ["submit"] else None
     return words[:begin], [] if begin is None else words[begin:]
 
 
 def _joins_cluster(command: Command) -> bool:
-    """Whether the command speaks to a Ray cluster that is there already."""
+    """Whether the command connects to a Ray cluster that is running already."""
     if isinstance(command, Train | Sweep):
         return command.launch.ray_address() is not None
     return isinstance(command, Submit) or (
@@ -127,40 +142,12 @@ def _joins_cluster(command: Command) -> bool:
 
 
 def execute(command: Command) -> int:
-    """Runs a command; returns its exit code. Imports are late: help must not wait for Ray and MLflow."""
-    guard_ray(_joins_cluster(command))  # which Ray reads when it is imported
-    if isinstance(command, Train | Resume):
-        from deploy.commands import train as training
-
-        return training.train(command) if isinstance(command, Train) else training.resume(command)
-    if isinstance(command, Sweep):
-        from deploy.commands.sweep import sweep
-
-        return sweep(command)
-    if isinstance(command, Submit):
-        from deploy.commands.submit import submit
-
-        return submit(command, cast("Train | Sweep", parse(command.command)))
-    if isinstance(command, Report):
-        from deploy.commands.report import report
-
-        return report(command)
-    if isinstance(command, Chaos):
-        from deploy.chaos.run import chaos
-
-        return chaos(command)
-    if isinstance(command, Export):
-        from deploy.commands.export import export
-
-        return export(command)
+    """Runs a command; returns its exit code."""
+    guard_ray(_joins_cluster(command))  # sets what Ray reads when it is imported
     if isinstance(command, Dashboard):
         require_packages("shoal dashboard", "dashboard", "plotly")
-        from deploy.commands.dashboard import dashboard
-
-        return dashboard(command)
-    from deploy.commands import evaluate as playing
-
-    return playing.evaluate(command) if isinstance(command, Evaluate) else playing.watch(command)
+    module = importlib.import_module(f"deploy.commands.{COMMANDS[type(command)]}")
+    return int(module.run(command))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -174,7 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except OSError as error:
-        if error.errno not in BAD_NAMES:
+        if error.errno not in BAD_PATH_ERRORS:
             raise
         name = str(error.filename)
         short = name if len(name) <= 60 else f"{name[:60]}..."

@@ -1,4 +1,4 @@
-"""The module that knows Ray's job server: submits a command, follows its log, and has it stopped."""
+"""Client of Ray's job server: submits a command, follows its log, and stops it."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from sim_core.checks import ConfigError
 ADDRESS = "RAY_API_SERVER_ADDRESS"
 DEFAULT_ADDRESS = "http://127.0.0.1:8265"
 STOP_WAIT = "RAY_JOB_STOP_WAIT_TIME_S"
-"""How long Ray lets a stopped job's command end by itself, after SIGTERM and before SIGKILL."""
-CHATTY = (
+"""An environment variable: seconds that Ray waits between SIGTERM and SIGKILL when a job is stopped."""
+NOISY_LOGGERS = (
     "ray.dashboard.modules.dashboard_sdk",
     "ray.dashboard.modules.job.sdk",
     "ray._private.runtime_env.packaging",
     "ray._private.runtime_env.working_dir",
 )
-"""Ray's loggers that tell what it uploads and when it hangs up."""
+"""Ray's loggers that report uploads and closed connections; only their errors are shown."""
 POLL_S = 0.2
 RETRY_S = 1.0
 
@@ -41,8 +41,8 @@ class Job(NamedTuple):
     has_ended: bool
 
 
-class Ending(NamedTuple):
-    """How a job ended: Ray's status (SUCCEEDED, FAILED or STOPPED), and its command's exit code where Ray knows it."""
+class JobResult(NamedTuple):
+    """Ray's status of an ended job (SUCCEEDED, FAILED or STOPPED), and its command's exit code if Ray knows it."""
 
     status: str
     exit_code: int | None
@@ -52,7 +52,7 @@ class JobServer:
     """The job server of a Ray cluster.
 
     Args:
-      address: the cluster's dashboard; RAY_API_SERVER_ADDRESS or this machine's by default.
+      address: the cluster's dashboard; RAY_API_SERVER_ADDRESS by default, else this machine's.
 
     Raises:
       ConfigError: nothing answers there, or it asks for a token.
@@ -60,15 +60,15 @@ class JobServer:
 
     def __init__(self, address: str | None) -> None:
         self.address = _url(address)
-        for name in CHATTY:
+        for name in NOISY_LOGGERS:
             logging.getLogger(name).setLevel(logging.ERROR)
-        os.environ[ADDRESS] = self.address  # Ray's client lets the environment decide, whatever it is given
-        with self._explained():
+        os.environ[ADDRESS] = self.address  # in Ray's client the environment overrides the argument
+        with self._clear_errors():
             self._client = JobSubmissionClient(self.address)
 
     @contextmanager
-    def _explained(self) -> Iterator[None]:
-        """Turns what goes wrong on the way to the server into one sentence."""
+    def _clear_errors(self) -> Iterator[None]:
+        """Turns errors of the connection and of the server into a ConfigError of one sentence."""
         try:
             yield
         except AuthenticationError as error:
@@ -78,54 +78,61 @@ class JobServer:
                 f"no Ray job server answers at {self.address} ({_cause(error)}); start one with `ray start --head`, "
                 "or name the cluster's dashboard with --address"
             ) from error
-        except RuntimeError as error:  # what the server answers other than OK
+        except RuntimeError as error:  # any answer but OK
             raise ConfigError(f"the Ray job server at {self.address} refused: {_cause(error)}") from error
 
     def attempts(self, name: str) -> list[Job]:
-        """The jobs that were submitted as `name`, first to last."""
-        with self._explained():
+        """The jobs that were submitted as `name`, in the order of their attempts."""
+        with self._clear_errors():
             found = {str(job.submission_id): job.status for job in self._client.list_jobs()}
         numbers = [int(end) for end in (key.removeprefix(f"{name}-") for key in found) if end.isdecimal()]
         ids = [f"{name}-{number}" for number in sorted(numbers) if f"{name}-{number}" in found]
         return [Job(key, found[key].is_terminal()) for key in ids]
 
     def submit(self, name: str, entrypoint: str, working_dir: Path, env: dict[str, str], stop_wait_s: int) -> Job:
-        """Submits a command as the next attempt of `name`; Ray uploads the folder but what its .gitignore names.
+        """Submits a command as the next attempt of `name`.
+
+        Args:
+          name: the job's id without the attempt number.
+          entrypoint: the command, as a shell line.
+          working_dir: folder that Ray uploads, without the files that its .gitignore names.
+          env: environment variables of the command.
+          stop_wait_s: seconds that a stopped job has before it is killed.
 
         Raises:
-          ConfigError: the server does not take it.
+          ConfigError: the server refuses it.
         """
         number = 1 + max((int(job.id.rpartition("-")[2]) for job in self.attempts(name)), default=0)
         runtime_env: dict[str, Any] = {
             "working_dir": str(working_dir),
             "env_vars": {**env, STOP_WAIT: str(stop_wait_s)},
         }
-        with self._explained():
+        with self._clear_errors():
             job = self._client.submit_job(
                 entrypoint=entrypoint, submission_id=f"{name}-{number}", runtime_env=runtime_env
             )
         return Job(job, False)
 
-    def ending(self, job: str) -> Ending:
-        """How a job ended."""
-        with self._explained():
+    def result(self, job: str) -> JobResult:
+        """A job's status and exit code."""
+        with self._clear_errors():
             info = self._client.get_job_info(job)
-        return Ending(info.status.value, info.driver_exit_code)
+        return JobResult(info.status.value, info.driver_exit_code)
 
-    def follow(self, job: str, stop: Callable[[], bool], write: Callable[[str], None], stopping: str) -> Ending:
-        """Passes a job's log on until the job has ended.
+    def follow(self, job: str, stop: Callable[[], bool], write: Callable[[str], None], stopping: str) -> JobResult:
+        """Writes a job's log until the job has ended.
 
         Args:
           job: its id.
-          stop: asks whether to have the job stopped; it goes on until it has ended by itself or Ray kills it.
-          write: takes pieces of text.
-          stopping: is written when the job is told to stop.
+          stop: polled; once true, the job is told to stop. Its log is still followed until it ends or Ray kills it.
+          write: called with pieces of the log.
+          stopping: written when the job is told to stop.
 
         Raises:
           ConfigError: the server no longer answers.
         """
 
-        async def both() -> None:
+        async def tail_and_watch() -> None:
             watcher = asyncio.create_task(self._stop_when_asked(job, stop, write, stopping))
             try:
                 await self._tail(job, write)
@@ -133,9 +140,10 @@ class JobServer:
                 watcher.cancel()
 
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "ssl=None is deprecated", DeprecationWarning)  # Ray's own call of aiohttp
-            asyncio.run(both())
-        return self.ending(job)
+            # Ray itself passes ssl=None to aiohttp.
+            warnings.filterwarnings("ignore", "ssl=None is deprecated", DeprecationWarning)
+            asyncio.run(tail_and_watch())
+        return self.result(job)
 
     async def _stop_when_asked(
         self, job: str, stop: Callable[[], bool], write: Callable[[str], None], stopping: str
@@ -143,11 +151,11 @@ class JobServer:
         while not stop():
             await asyncio.sleep(POLL_S)
         write(f"{stopping}\n")
-        with self._explained():
+        with self._clear_errors():
             await asyncio.to_thread(self._client.stop_job, job)
 
     async def _tail(self, job: str, write: Callable[[str], None]) -> None:
-        """Writes the log from its beginning; where the connection breaks, goes on behind what was written."""
+        """Writes the log from its beginning; after a broken connection, continues where it stopped."""
         written = 0
         while True:
             seen = 0
@@ -158,16 +166,16 @@ class JobServer:
                     written = max(written, seen)
             except (RuntimeError, aiohttp.ClientError):
                 pass
-            if JobStatus(self.ending(job).status).is_terminal():
+            if JobStatus(self.result(job).status).is_terminal():
                 return
             await asyncio.sleep(RETRY_S)
 
 
 def _url(address: str | None) -> str:
-    """The dashboard's URL; `http://` where no scheme is given.
+    """The dashboard's URL; `http://` is added if no scheme is given.
 
     Raises:
-      ConfigError: the address is of another kind.
+      ConfigError: its scheme is neither http nor https.
     """
     given = address or os.environ.get(ADDRESS) or DEFAULT_ADDRESS
     scheme, separator, _ = given.partition("://")
@@ -177,6 +185,6 @@ def _url(address: str | None) -> str:
 
 
 def _cause(error: Exception) -> str:
-    """The last line of an error's text, which says what went wrong."""
+    """The last line of an error's text, which states the cause."""
     lines = [line for line in str(error).splitlines() if line.strip()]
     return lines[-1].strip() if lines else type(error).__name__

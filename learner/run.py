@@ -16,6 +16,7 @@ from learner.checkpoints.manifest import CheckpointError, UselessCheckpointError
 from learner.config import RunConfig
 from learner.file_names import CONFIG
 from learner.loop import TrainingLoop
+from learner.placement import Place
 from learner.ray_backend.cluster import ray_cluster
 from learner.ray_backend.metrics import RayMetrics
 from learner.run_folder import RunFolder
@@ -25,7 +26,7 @@ from learner.tracking.journal import Journal, PushedMark, Row
 from learner.tracking.mlflow_run import TROUBLE, Tracker
 from learner.tracking.observer import Display, MirroringObserver
 from learner.tracking.redaction import hide_secrets
-from learner.training.cluster import Cluster, Place, process_cluster
+from learner.training.cluster import Cluster, process_cluster
 from learner.training.evaluation_summary import Evaluation, as_metrics, summarise
 from learner.training.recovery import RunLost
 from learner.training.stop_signals import stop_on_signals

@@ -1,1 +1,1 @@
-"""Pooling of results over seeds, and the checks of the claims."""
+"""Results pooled over training seeds, and the claims judged on them."""

@@ -1,11 +1,13 @@
-"""The table of results as cells: counts pooled over training seeds, and quantities made of several cells' rates.
+"""Results pooled over training seeds, and quantities computed from several pooled cells.
 
-Rates have Wilson intervals on the pooled counts. Where several training seeds stand behind a rate, its interval also
-holds what another seed would change: counts of different seeds vary far more than those of one policy's episodes, by a
-factor that is estimated over the cells of one method and as many robots, for each outcome, apart for Fixed and
-Extrapolation. That is, variances over seeds are taken as proportional to p(1 - p), which success in the setup of the
-training follows; the variance of rarer outcomes and of Extrapolation grows faster with p, so that their intervals are
-too narrow, by up to a half, near 50 % and too wide near 0. With one seed it speaks of that policy alone.
+Rates have Wilson intervals on the pooled counts. Counts of different training seeds vary far more than those of one
+policy's episodes. Where a rate pools several seeds, its interval is therefore widened to hold what another seed would
+give. The factor is estimated for each outcome over the cells of one method and robot count, separately for Fixed and
+Extrapolation.
+
+The estimate takes variances over seeds as proportional to p(1 - p). Success in the setup of the training follows this.
+The variances of rarer outcomes and of Extrapolation grow faster with p. Their intervals are too narrow, by up to a
+half, near 50 % and too wide near 0. A rate of a single seed speaks of that policy alone.
 """
 
 from __future__ import annotations
@@ -25,11 +27,11 @@ from sim_core.checks import require
 from sim_core.outcomes import ENDED, Outcome
 
 CELLS_PER_METHOD = len(ROBOTS) * len(GROUPS)
-"""The dissertation's setups."""
+"""Number of the dissertation's setups."""
 
 
 rate = functools.lru_cache(maxsize=8192)(estimates.rate)
-"""`actors.evaluation.statistics.rate`, remembered: a report asks for the same cells many times."""
+"""`actors.evaluation.statistics.rate`, cached: a report asks for the same cells many times."""
 
 
 class Setup(NamedTuple):
@@ -45,8 +47,11 @@ class Setup(NamedTuple):
 SETUPS = tuple(Setup(robots, groups) for robots in ROBOTS for groups in GROUPS)
 
 
-class Measured(NamedTuple):
-    """A quantity with its 95 % interval, the episodes behind it, and where it is one rate, its range over seeds."""
+class Measurement(NamedTuple):
+    """A quantity with its 95 % interval, and the numbers of episodes and training seeds behind it.
+
+    `seed_range` is the lowest and highest rate of a seed; None for one seed, or if the quantity is not a single rate.
+    """
 
     estimate: Estimate
     episodes: int
@@ -55,11 +60,15 @@ class Measured(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Cell:
-    """All evaluations of one method, trained in one setup and played in one, a row a training seed."""
+class PooledCell:
+    """The evaluations of one method, trained in one setup and tested in one, pooled over training seeds.
+
+    `rows` has one row per seed; `overdispersion` the factor by which counts of seeds vary more than binomial ones, by
+    outcome (1 if not given).
+    """
 
     rows: tuple[ResultRow, ...]
-    spread: Mapping[Outcome, float] = field(default_factory=dict)
+    overdispersion: Mapping[Outcome, float] = field(default_factory=dict)
 
     @property
     def episodes(self) -> int:
@@ -70,51 +79,54 @@ class Cell:
         """Episodes over all seeds that ended in `outcome`."""
         return sum(row.count(outcome) for row in self.rows)
 
-    def share(self, outcome: Outcome) -> Measured:
-        """How often an episode ends in `outcome`."""
+    def share(self, outcome: Outcome) -> Measurement:
+        """Share of episodes that end in `outcome`."""
         per_seed = [row.count(outcome) / row.episodes for row in self.rows]
-        return Measured(
-            estimate=rate(self.count(outcome), self.episodes, self._spread(outcome)),
+        return Measurement(
+            estimate=rate(self.count(outcome), self.episodes, self._factor(outcome)),
             episodes=self.episodes,
             seeds=len(self.rows),
             seed_range=(min(per_seed), max(per_seed)) if len(per_seed) > 1 else None,
         )
 
-    def failures(self) -> Measured:
-        """How often an episode does not end in the goal, for whatever reason."""
+    def failures(self) -> Measurement:
+        """Share of episodes that end in any outcome but the goal."""
         failed = self.episodes - self.count(Outcome.GOAL)
-        return Measured(rate(failed, self.episodes, self._spread(Outcome.GOAL)), self.episodes, len(self.rows))
+        return Measurement(rate(failed, self.episodes, self._factor(Outcome.GOAL)), self.episodes, len(self.rows))
 
-    def _spread(self, outcome: Outcome) -> float:
-        return self.spread.get(outcome, 1.0) if len(self.rows) > 1 else 1.0
+    def _factor(self, outcome: Outcome) -> float:
+        return self.overdispersion.get(outcome, 1.0) if len(self.rows) > 1 else 1.0
 
-    def lost_less_captured(self) -> Measured:
-        """Share of lost episodes less that of captured ones.
+    def lost_minus_captured(self) -> Measurement:
+        """Share of lost episodes minus share of captured ones.
 
-        Both are shares of the same episodes, where one outcome excludes the other; the interval is Zou's (2007), which
-        is Newcombe's with their correlation.
+        Both are shares of the same episodes, and one outcome excludes the other. The interval is Zou's (2007):
+        Newcombe's with the correlation of the two.
         """
         lost, captured = self.share(Outcome.LOST).estimate, self.share(Outcome.CAPTURED).estimate
         odds = lost.value * captured.value / max((1 - lost.value) * (1 - captured.value), 1e-12)
         correlation = -min(float(np.sqrt(odds)), 1.0)
         value = lost.value - captured.value
-        down = _joined(lost.value - lost.low, captured.high - captured.value, correlation)
-        up = _joined(lost.high - lost.value, captured.value - captured.low, correlation)
-        return Measured(Estimate(value, value - down, value + up), self.episodes, len(self.rows))
+        down = _half_width(lost.value - lost.low, captured.high - captured.value, correlation)
+        up = _half_width(lost.high - lost.value, captured.value - captured.low, correlation)
+        return Measurement(Estimate(value, value - down, value + up), self.episodes, len(self.rows))
 
 
-def _joined(first: float, second: float, correlation: float) -> float:
-    """Half-width of a difference from those of its terms, whose estimates correlate."""
+def _half_width(first: float, second: float, correlation: float) -> float:
+    """Half-width of a difference's interval, from those of its terms and the correlation of their estimates."""
     return float(np.sqrt(max(first**2 + second**2 - 2 * correlation * first * second, 0.0)))
 
 
 def _kind(method: str, trained: Setup, played: Setup) -> tuple[str, int, bool]:
-    """Cells of one kind share how much seeds differ: method, robots of the training, whether Fixed."""
+    """Method, robots of the training, whether Fixed: cells of one kind share an overdispersion factor."""
     return method, trained.robots, trained == played
 
 
-def _spread_over_seeds(cells: Sequence[Sequence[ResultRow]]) -> dict[Outcome, float]:
-    """How much the counts of cells, each a row a seed, vary over seeds; one policy in many setups is one seed."""
+def _overdispersion(cells: Sequence[Sequence[ResultRow]]) -> dict[Outcome, float]:
+    """The overdispersion factor of each outcome over cells of one kind, each with one row per seed.
+
+    A policy tested in many setups counts as one seed in the degrees of freedom.
+    """
     policies = {(row.trained_robots, row.trained_groups, row.seed) for rows in cells for row in rows}
     freedom = len(policies) - len({policy[:2] for policy in policies})
     return {
@@ -124,10 +136,10 @@ def _spread_over_seeds(cells: Sequence[Sequence[ResultRow]]) -> dict[Outcome, fl
 
 
 class Results:
-    """The learned policies' results of one preset, by method and setup.
+    """Results of one preset's learned policies, pooled over seeds, by method and setup.
 
     Raises:
-      ConfigError: two rows count the same policy in the same setup.
+      ConfigError: two rows hold the same policy in the same setup.
     """
 
     def __init__(self, rows: Iterable[ResultRow]) -> None:
@@ -143,92 +155,93 @@ class Results:
                 f"the results count {method} trained in {trained} and played in {played} twice for one seed; "
                 "make the table again",
             )
-        kin: dict[tuple[str, int, bool], list[list[ResultRow]]] = {}
+        by_kind: dict[tuple[str, int, bool], list[list[ResultRow]]] = {}
         for key, same in found.items():
-            kin.setdefault(_kind(*key), []).append(same)
-        spreads = {kind: _spread_over_seeds(cells) for kind, cells in kin.items()}
-        self._cells = {key: Cell(tuple(same), spreads[_kind(*key)]) for key, same in found.items()}
+            by_kind.setdefault(_kind(*key), []).append(same)
+        factors = {kind: _overdispersion(cells) for kind, cells in by_kind.items()}
+        self._cells = {key: PooledCell(tuple(same), factors[_kind(*key)]) for key, same in found.items()}
 
-    def fixed(self, method: str, setup: Setup) -> Cell | None:
-        """The cell trained and played in `setup`, None if it is missing."""
+    def fixed(self, method: str, setup: Setup) -> PooledCell | None:
+        """The cell trained and tested in `setup`; None if it is missing."""
         return self._cells.get((method, setup, setup))
 
-    def transferred(self, method: str, trained: Setup, played: Setup) -> Cell | None:
-        """The cell trained in one setup and played in one, None if it is missing."""
+    def transferred(self, method: str, trained: Setup, played: Setup) -> PooledCell | None:
+        """The cell trained in the setup `trained` and tested in `played`; None if it is missing."""
         return self._cells.get((method, trained, played))
 
-    def cells(self) -> list[Cell]:
+    def cells(self) -> list[PooledCell]:
         """All cells, Fixed and Extrapolation."""
         return list(self._cells.values())
 
     def methods(self) -> list[str]:
-        """The dissertation's three methods, then others that there are results of."""
+        """The dissertation's three methods, then others that have results."""
         return in_order(method for method, _, _ in self._cells)
 
     def fixed_present(self, method: str) -> list[Setup]:
-        """The dissertation's setups whose Fixed cell is there."""
+        """The dissertation's setups that have a Fixed cell."""
         return [setup for setup in SETUPS if self.fixed(method, setup) is not None]
 
 
-Measure = Callable[[Cell], Measured]
+Metric = Callable[[PooledCell], Measurement]
+"""A quantity of one cell."""
 
 
-def success(cell: Cell) -> Measured:
+def success(cell: PooledCell) -> Measurement:
     """Share of episodes that end in the goal."""
     return cell.share(Outcome.GOAL)
 
 
-def lost(cell: Cell) -> Measured:
+def lost(cell: PooledCell) -> Measurement:
     """Share of all episodes in which the robot is lost."""
     return cell.share(Outcome.LOST)
 
 
-def captured(cell: Cell) -> Measured:
+def captured(cell: PooledCell) -> Measurement:
     """Share of all episodes in which the robot is captured."""
     return cell.share(Outcome.CAPTURED)
 
 
-def measured(cell: Cell | None, measure: Measure) -> Measured | None:
-    """`measure` of a cell, None where it is missing."""
-    return None if cell is None else measure(cell)
+def measured(cell: PooledCell | None, metric: Metric) -> Measurement | None:
+    """`metric` of a cell; None if the cell is missing."""
+    return None if cell is None else metric(cell)
 
 
-def weighted_sum(parts: Sequence[tuple[float, Measured | None]]) -> Measured | None:
-    """The sum of weight × quantity, None where a quantity is missing; quantities are independent.
+def weighted_sum(weighted: Sequence[tuple[float, Measurement | None]]) -> Measurement | None:
+    """The sum of weight × quantity over independent quantities; None if one is missing.
 
-    Its interval is Donner and Zou's (2012): each quantity's distance to its limit, weighted, squared and added. For two
-    rates with weights 1 and -1 it is Newcombe's.
+    The interval is Donner and Zou's (2012): the weighted distances of the quantities to their limits, added in
+    quadrature. For two rates with weights 1 and -1 it is Newcombe's.
     """
-    terms = [(weight, part) for weight, part in parts if part is not None]
-    if len(terms) < len(parts):
+    terms = [(weight, term) for weight, term in weighted if term is not None]
+    if len(terms) < len(weighted):
         return None
-    value = sum(weight * part.estimate.value for weight, part in terms)
+    value = sum(weight * term.estimate.value for weight, term in terms)
     down, up = 0.0, 0.0
-    for weight, part in terms:
-        to_low, to_high = part.estimate.value - part.estimate.low, part.estimate.high - part.estimate.value
+    for weight, term in terms:
+        to_low, to_high = term.estimate.value - term.estimate.low, term.estimate.high - term.estimate.value
         below, above = (to_low, to_high) if weight >= 0 else (to_high, to_low)
         down, up = down + (weight * below) ** 2, up + (weight * above) ** 2
     estimate = Estimate(value, value - float(np.sqrt(down)), value + float(np.sqrt(up)))
-    return Measured(
-        estimate, sum(part.episodes for _, part in terms), max((part.seeds for _, part in terms), default=0)
+    return Measurement(
+        estimate, sum(term.episodes for _, term in terms), max((term.seeds for _, term in terms), default=0)
     )
 
 
-def difference(first: Measured | None, second: Measured | None) -> Measured | None:
-    """`first` less `second`."""
+def difference(first: Measurement | None, second: Measurement | None) -> Measurement | None:
+    """`first` minus `second`; None if one is missing."""
     return weighted_sum([(1.0, first), (-1.0, second)])
 
 
-def average(parts: Sequence[Measured | None]) -> Measured | None:
-    """The mean of quantities, each with the same weight however many episodes it has; None where one is missing."""
-    return weighted_sum([(1.0 / len(parts), part) for part in parts])
+def average(terms: Sequence[Measurement | None]) -> Measurement | None:
+    """The unweighted mean of quantities, whatever their numbers of episodes; None if one is missing."""
+    return weighted_sum([(1.0 / len(terms), term) for term in terms])
 
 
-def over_groups(results: Results, method: str, robots: int, measure: Measure) -> Measured | None:
-    """`measure` of the Fixed cells with `robots` per group, the mean of all group counts."""
-    return average([measured(results.fixed(method, Setup(robots, groups)), measure) for groups in GROUPS])
+def over_groups(results: Results, method: str, robots: int, metric: Metric) -> Measurement | None:
+    """`metric` of the Fixed cells with `robots` per group, averaged over all group counts; None if one is missing."""
+    return average([measured(results.fixed(method, Setup(robots, groups)), metric) for groups in GROUPS])
 
 
-def over_robots(results: Results, method: str, groups: int, measure: Measure) -> Measured | None:
-    """`measure` of the Fixed cells with `groups` groups, the mean of all robot counts."""
-    return average([measured(results.fixed(method, Setup(robots, groups)), measure) for robots in ROBOTS])
+def over_robots(results: Results, method: str, groups: int, metric: Metric) -> Measurement | None:
+    """`metric` of the Fixed cells with `groups` groups, averaged over all robot counts; None if one is missing."""
+    return average([measured(results.fixed(method, Setup(robots, groups)), metric) for robots in ROBOTS])

@@ -1,16 +1,16 @@
-"""What a claim is made of: checks, each a measured quantity that must lie in a range, and their verdicts.
+"""The checks that a claim consists of: each a measured quantity that must lie in a range, and its verdict.
 
-All tolerances of the claims stand here:
+All tolerances of the claims are defined here:
 
 - `≈ x %` of a success rate, read from a bar chart: within 10 points of x. Of a failure rate: within 2 points.
 - "at least as good", "flat", "similar": differs by at most 2 points.
 - "none": at most 0.5 %, which is printed as 0 %.
 - "decays fast": falls by at least 20 points from 1 to 8 groups. (The text calls smooth what stays above 80 %.)
 
-A check holds where the whole 95 % interval lies in its range, fails where none of it does, and is undecided between.
-Only `≈` and "around" are met by the value alone: they fail where the whole interval is outside, and are undecided where
-the value is outside but a part of the interval is not. The intervals are those of single checks: of 50 true checks at
-their limit, one or two are expected to fail by chance.
+A check holds if its whole 95 % interval lies in the range, fails if none of it does, and is undecided otherwise.
+`≈` and "around" are judged by the value alone: they hold if the value lies in the range, fail if the whole interval
+lies outside, and are undecided otherwise. The intervals are those of single checks. Of 50 checks whose truth lies on
+the limit, one or two are expected to fail by chance.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from actors.evaluation.statistics import Estimate, as_percent
-from dashboards.analysis.aggregate import Measured, Setup
+from dashboards.analysis.aggregate import Measurement, Setup
 
 ABOUT = 0.10
 ABOUT_FAILURE = 0.02
@@ -31,7 +31,7 @@ FAST = 0.20
 
 
 class Verdict(enum.StrEnum):
-    """What the numbers say of a check or a claim."""
+    """Verdict on a check or a claim."""
 
     HOLDS = "holds"
     FAILS = "does not hold"
@@ -40,16 +40,16 @@ class Verdict(enum.StrEnum):
 
 
 class Check(NamedTuple):
-    """One quantity of a claim and the range [low, high] that the claim puts it in.
+    """One quantity of a claim and the range [low, high] in which the claim puts it.
 
-    Fields: name, short and unique in its claim; the range in words; what was measured, None without data; whether the
-    value alone may meet the range; whether the quantity is a difference, shown in points; the setup that the check is
-    for, where a claim goes through all of them.
+    Fields: name, short and unique in its claim; the range in words; the measured quantity, None without data; its
+    limits; whether the value alone decides (`≈`); whether the quantity is a difference, shown in points; the setup of
+    the check, if the claim is about every setup.
     """
 
     name: str
     wanted: str
-    measured: Measured | None
+    measured: Measurement | None
     low: float = -math.inf
     high: float = math.inf
     by_value: bool = False
@@ -76,47 +76,47 @@ class Claim(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of the checks: one that fails refutes the claim, whatever is missing."""
+        """The worst verdict of the checks: one that fails refutes the claim, whatever data are missing."""
         found = {check.verdict for check in self.checks}
         worst_first = (Verdict.FAILS, Verdict.NO_DATA, Verdict.UNDECIDED)
         return next((verdict for verdict in worst_first if verdict in found), Verdict.HOLDS)
 
 
-def about(name: str, measured: Measured | None, value: float, tolerance: float = ABOUT) -> Check:
+def about(name: str, measured: Measurement | None, value: float, tolerance: float = ABOUT) -> Check:
     """`≈ value`: the rate lies within `tolerance`."""
     low, high = max(round(value - tolerance, 6), 0.0), min(round(value + tolerance, 6), 1.0)
     wanted = f"≈ {_plain(value)} % ({_plain(low)} … {_plain(high)} %)"
     return Check(name, wanted, measured, low, high, by_value=True)
 
 
-def around_or_more(name: str, measured: Measured | None, value: float) -> Check:
+def around_or_more(name: str, measured: Measurement | None, value: float) -> Check:
     """`around value or more`: as `about`, without an upper limit."""
     low = round(value - ABOUT, 6)
     return Check(name, f"around {_plain(value)} % or more (≥ {_plain(low)} %)", measured, low, by_value=True)
 
 
-def at_least(name: str, measured: Measured | None, limit: float) -> Check:
+def at_least(name: str, measured: Measurement | None, limit: float) -> Check:
     """The rate is `limit` or more."""
     return Check(name, f"≥ {_plain(limit)} %", measured, low=limit)
 
 
-def at_most(name: str, measured: Measured | None, limit: float) -> Check:
+def at_most(name: str, measured: Measurement | None, limit: float) -> Check:
     """The rate is `limit` or less."""
     return Check(name, f"≤ {_plain(limit)} %", measured, high=limit)
 
 
-def rises(name: str, measured: Measured | None, by: float = 0.0) -> Check:
-    """The difference is above `by`."""
+def rises(name: str, measured: Measurement | None, by: float = 0.0) -> Check:
+    """The difference is greater than `by`."""
     return Check(name, f"> {_plain(by)} points", measured, low=by, is_difference=True)
 
 
-def no_worse(name: str, measured: Measured | None) -> Check:
-    """The difference is no fall by more than ALIKE."""
+def no_worse(name: str, measured: Measurement | None) -> Check:
+    """The difference is greater than -ALIKE."""
     return Check(name, f"> −{_plain(ALIKE)} points", measured, low=-ALIKE, is_difference=True)
 
 
-def alike(name: str, measured: Measured | None) -> Check:
-    """The difference is at most ALIKE either way."""
+def alike(name: str, measured: Measurement | None) -> Check:
+    """The difference is between -ALIKE and ALIKE."""
     return Check(name, f"within ±{_plain(ALIKE)} points", measured, -ALIKE, ALIKE, is_difference=True)
 
 
@@ -131,12 +131,12 @@ def as_points(estimate: Estimate) -> str:
 
 
 def number_text(check: Check) -> str:
-    """The measured value with its interval, `–` without data."""
+    """The measured value with its interval; `–` without data."""
     if check.measured is None:
         return "–"
     return (as_points if check.is_difference else as_percent)(check.measured.estimate)
 
 
 def with_verdict(checks: Sequence[Check], verdict: Verdict) -> list[Check]:
-    """The checks that have `verdict`."""
+    """The checks with `verdict`."""
     return [check for check in checks if check.verdict is verdict]

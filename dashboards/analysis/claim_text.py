@@ -1,4 +1,4 @@
-"""The judged claims as Markdown: a table of verdicts, and every check with its numbers."""
+"""Judged claims as Markdown: a table of verdicts, and a table of every claim's checks."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 from dashboards.analysis.claim_checks import Check, Claim, Verdict, number_text, with_verdict
 
 SHOWN_WHOLE = 5
-"""A claim with this many checks or fewer shows all of them in the table."""
+"""The table shows all checks of a claim with at most this many."""
 NAMED_AT_MOST = 10
-"""This many checks without data, or undecided, are named; more are only counted."""
+"""At most this many checks without data, or undecided, are named; more are counted."""
 DETAILS = ("check", "wanted", "measured (95 % interval)", "seeds", "episodes", "verdict")
 """Columns of a table of checks."""
 NOTE = """\
@@ -30,31 +30,31 @@ def table_of(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def verdict_table(claims: Sequence[Claim]) -> list[str]:
-    """The table of claims: number, text, verdict, evidence; as lines."""
+    """Lines of the table of claims: number, text, verdict, evidence."""
     rows = [(str(claim.number), claim.text, _strong(claim.verdict), evidence(claim)) for claim in claims]
     return table_of(("#", "claim", "verdict", "evidence"), rows)
 
 
 def tally(claims: Sequence[Claim]) -> str:
-    """How many claims have each verdict, in one line."""
+    """The number of claims with each verdict, in one line."""
     counts = {verdict: sum(claim.verdict is verdict for claim in claims) for verdict in Verdict}
     return ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
 
 
 def evidence(claim: Claim) -> str:
-    """The numbers behind a verdict: all of a short claim's; of a long one's those that do not hold."""
+    """The numbers behind a verdict: every check of a short claim; of a long one, the checks that do not hold."""
     if len(claim.checks) <= SHOWN_WHOLE:
         return "; ".join(f"{check.name} {number_text(check)}{_remark(check)}" for check in claim.checks)
-    parts = [_how_many_hold(claim.checks)]
+    words = [_how_many_hold(claim.checks)]
     failing = with_verdict(claim.checks, Verdict.FAILS)
     if failing:
         named = ", ".join(f"{check.name} {_value_text(check)}" for check in failing)
-        parts.append(f"not: {named}")
+        words.append(f"not: {named}")
     for verdict in (Verdict.UNDECIDED, Verdict.NO_DATA):
         checks = with_verdict(claim.checks, verdict)
         if checks:
-            parts.append(f"{verdict}: {_names(checks)}")
-    return "; ".join(parts)
+            words.append(f"{verdict}: {_names(checks)}")
+    return "; ".join(words)
 
 
 def _how_many_hold(checks: Sequence[Check]) -> str:
@@ -69,7 +69,7 @@ def _how_many_hold(checks: Sequence[Check]) -> str:
 
 
 def details(claims: Sequence[Claim]) -> list[str]:
-    """Every check of every claim with its numbers; as lines."""
+    """Lines with every claim's table of checks."""
     lines: list[str] = []
     for claim in claims:
         rows = [detail_row(check) for check in claim.checks]
@@ -78,7 +78,7 @@ def details(claims: Sequence[Claim]) -> list[str]:
 
 
 def claims_markdown(judged: dict[str, list[Claim]]) -> str:
-    """The whole page: for each preset the table and the details."""
+    """The page: for each preset the table of claims, and the checks of each."""
     lines = ["# The dissertation's claims, checked", "", NOTE, ""]
     for preset, claims in judged.items():
         lines += [f"## Preset {preset}", "", f"{tally(claims).capitalize()}.", "", *verdict_table(claims), ""]

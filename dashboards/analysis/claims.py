@@ -1,15 +1,15 @@
 """The dissertation's fifteen claims as code: each a list of checks on the pooled results of one preset.
 
-How the text was made precise, where it leaves a choice:
+Where the text leaves a choice, it is read as follows:
 
 - A failure is every episode that does not end in the goal. Lost and captured are shares of all episodes.
-- Claims about causes of failure (10, 15) speak of means: over the five group counts for a number of robots, over the
+- Claims about causes of failure (10, 15) are about means: over the five group counts for a number of robots, over the
   five robot counts for a number of groups.
-- "Grows" is: the last above the first, and no step down by more than 2 points. For all failures over the number of
-  robots only the ends count, because the text itself has them fall from 5 to 10 robots (claim 6).
+- "Grows": the last value is above the first, and no step falls by more than 2 points. For all failures over the number
+  of robots only the ends count, because the text itself says that they fall from 5 to 10 robots (claim 6).
 - The claimed exceptions (7: below 80 % at 8 groups; 14: 15r×8g) are checks too.
-- 12: "mostly by collision" is: of all failures in the 25 setups, more than half are collisions.
-- 15: fewer captured than M_sensor from 10 robots on; with 5 robots there are none in either method. "≤ 6 %" is of both.
+- 12, "mostly by collision": of all failures in the 25 setups, more than half are collisions.
+- 15: fewer captured than M_sensor from 10 robots on; with 5 robots neither method has any. "≤ 6 %" is about both.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from actors.evaluation.result_table import GROUPS, ROBOTS
 from actors.evaluation.statistics import ratio
 from dashboards.analysis.aggregate import (
     SETUPS,
-    Cell,
-    Measured,
+    Measurement,
+    PooledCell,
     Results,
     Setup,
     captured,
@@ -52,21 +52,21 @@ from sim_core.outcomes import Outcome
 
 
 def judge(results: Results) -> list[Claim]:
-    """All claims, in their order, with the checks that the results of one preset give them."""
+    """All claims in the order of the text, with their checks on the results of one preset."""
     return [Claim(number, text, checks(results)) for number, (text, checks) in enumerate(CLAIMS, start=1)]
 
 
-def _rate(results: Results, method: str, robots: int, groups: int) -> Measured | None:
+def _rate(results: Results, method: str, robots: int, groups: int) -> Measurement | None:
     return measured(results.fixed(method, Setup(robots, groups)), success)
 
 
-def _fall(results: Results, method: str, first: Setup, last: Setup) -> Measured | None:
-    """Success in `first` less that in `last`."""
+def _fall(results: Results, method: str, first: Setup, last: Setup) -> Measurement | None:
+    """Success in `first` minus success in `last`."""
     return difference(_rate(results, method, *first), _rate(results, method, *last))
 
 
-def _over_fixed(results: Results, trained: Setup, played: Setup) -> Measured | None:
-    """Success of the policy trained elsewhere less that of the Fixed one, both played in `played`."""
+def _over_fixed(results: Results, trained: Setup, played: Setup) -> Measurement | None:
+    """Success of the policy trained in `trained` minus that of the Fixed policy, both tested in `played`."""
     foreign = measured(results.transferred("sensor", trained, played), success)
     return difference(foreign, _rate(results, "sensor", *played))
 
@@ -127,8 +127,8 @@ def _transfers(results: Results) -> list[Check]:
     ]
 
 
-def _grows(name: str, values: Sequence[Measured | None], labels: Sequence[str]) -> list[Check]:
-    """The last is above the first, and no step falls by more than ALIKE."""
+def _grows(name: str, values: Sequence[Measurement | None], labels: Sequence[str]) -> list[Check]:
+    """Checks that the last value is above the first, and that no step falls by more than ALIKE."""
     steps = zip(pairwise(labels), pairwise(values), strict=True)
     ends = rises(f"{name} {labels[0]} → {labels[-1]}", difference(values[-1], values[0]))
     return [ends, *(no_worse(f"{name} {a} → {b}, a step", difference(late, early)) for (a, b), (early, late) in steps)]
@@ -136,8 +136,8 @@ def _grows(name: str, values: Sequence[Measured | None], labels: Sequence[str]) 
 
 def _failure_causes(results: Results) -> list[Check]:
     robots, groups = [f"{n}r" for n in ROBOTS], [f"{m}g" for m in GROUPS]
-    failed = [over_groups(results, "sensor", n, Cell.failures) for n in ROBOTS]
-    failed_by_groups = [over_robots(results, "sensor", m, Cell.failures) for m in GROUPS]
+    failed = [over_groups(results, "sensor", n, PooledCell.failures) for n in ROBOTS]
+    failed_by_groups = [over_robots(results, "sensor", m, PooledCell.failures) for m in GROUPS]
     taken = [over_groups(results, "sensor", n, captured) for n in ROBOTS]
     gone = dict(zip(ROBOTS, (over_groups(results, "sensor", n, lost) for n in ROBOTS), strict=True))
     return [
@@ -147,7 +147,7 @@ def _failure_causes(results: Results) -> list[Check]:
         rises("lost 5r less 10r", difference(gone[5], gone[10])),
         alike("lost 10r → 15r", difference(gone[15], gone[10])),
         *_grows("lost", [gone[n] for n in ROBOTS[2:]], robots[2:]),
-        alike("lost less captured at 8g", over_robots(results, "sensor", GROUPS[-1], Cell.lost_less_captured)),
+        alike("lost less captured at 8g", over_robots(results, "sensor", GROUPS[-1], PooledCell.lost_minus_captured)),
     ]
 
 
@@ -167,14 +167,14 @@ def _in_is_poor(results: Results) -> list[Check]:
     return [*poor, at_least("collisions among failures", _collisions_among_failures(results), 0.5)]
 
 
-def _collisions_among_failures(results: Results) -> Measured | None:
+def _collisions_among_failures(results: Results) -> Measurement | None:
     found = [results.fixed("in", setup) for setup in SETUPS]
     cells = [cell for cell in found if cell is not None]
     failed = sum(cell.episodes - cell.count(Outcome.GOAL) for cell in cells)
     if len(cells) < len(SETUPS) or failed == 0:
         return None
     seeds = [[(row.collision, row.episodes - row.goal) for row in cell.rows] for cell in cells]
-    return Measured(ratio(seeds), failed, max(len(cell.rows) for cell in cells))
+    return Measurement(ratio(seeds), failed, max(len(cell.rows) for cell in cells))
 
 
 def _out_decays(results: Results) -> list[Check]:

@@ -1,4 +1,4 @@
-"""How methods are called and drawn, in every table, figure and chart."""
+"""Labels and styles of methods in every table, figure and chart."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sim_core.plugins import METHODS, load
 
 
 class MethodStyle(NamedTuple):
-    """How a method is drawn, so that none is told by its colour alone.
+    """The style of a method; methods differ in more than their colours.
 
     `colour`, `hatch` and `marker` are matplotlib's; `css_colour` (a variable of base.css), `dash` and `symbol` are
     Plotly's.
@@ -32,18 +32,18 @@ STYLES = (
     MethodStyle("#CC79A7", "\\\\\\\\", "v", "--other-2", "longdash", "triangle-down"),
     MethodStyle("#56B4E9", "++", "P", "--other-3", "longdashdot", "cross"),
 )
-"""Of the dissertation's methods in their order, then of others; Okabe and Ito's colours, and grey."""
+"""Styles of the dissertation's methods in their order, then of others; Okabe and Ito's colours, and grey."""
 DISSERTATION = tuple(METHODS.built_in)[:3]
 """M_sensor, M_IN and M_OUT."""
 
 
 def method_label(name: str) -> str:
-    """What people call a method that a table of results names; a user's own is called by its class."""
+    """Label of a method, by its name in a table of results; a user's own method is called by its class."""
     return str(load(METHODS, name, "").label) if name in METHODS.built_in else name
 
 
 def method_style(name: str) -> MethodStyle:
-    """How a method is drawn: the dissertation's as always, another one by its name."""
+    """The style of a method: fixed for the dissertation's methods, chosen by a hash of the name for others."""
     if name in DISSERTATION:
         return STYLES[DISSERTATION.index(name)]
     others = STYLES[len(DISSERTATION) :]
@@ -51,5 +51,5 @@ def method_style(name: str) -> MethodStyle:
 
 
 def in_order(names: Iterable[str]) -> list[str]:
-    """The dissertation's three methods, then those of `names` that are others."""
+    """The dissertation's three methods, then the other methods in `names`."""
     return [*DISSERTATION, *sorted(set(names) - set(DISSERTATION))]

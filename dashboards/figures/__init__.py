@@ -1,1 +1,1 @@
-"""Pictures by matplotlib."""
+"""Figures drawn by matplotlib, as PNG, and videos of episodes."""

@@ -1,9 +1,9 @@
-"""The dissertation's diagrams, drawn from a live state: M_sensor's view, the groups' ellipses, M_OUT's velocity.
+"""The dissertation's diagrams, drawn from a simulated state: M_sensor's view, the groups' ellipses, M_OUT's velocity.
 
-Every number comes from the code that trains: counts, ellipses, the potential field and the velocities are those of
-`sim_core.methods`. The episodes are driven by FL-ORCA alone, and no network is asked: the heading drawn in 3.1 is that
-of the sector with the highest count, as in the dissertation's example; u_nn in 4.3 is the heading nearest to the
-direction of the own group's centre.
+Every number comes from the code that trains: counts, ellipses, the potential field and velocities are those of
+`sim_core.methods`. FL-ORCA drives all robots, and no network is asked. The heading in 3.1 is that of the sector with
+the highest count, as in the dissertation's example. u_nn in 4.3 is the heading nearest to the direction of the own
+group's centre.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from sim_core.render import GROUP_COLOURS
 from sim_core.worlds import WorldBatch
 
 DRAWN_SETUP = Setup(10, 3)
-"""Robots per group, and groups, of the worlds that are drawn."""
+"""Robots per group, and groups, of the drawn worlds."""
 HEADING, FIELD, SUM = "#1C2024", "#D55E00", "#0072B2"
 EPISODE_SEED = 3
 
@@ -47,9 +47,9 @@ Score = Callable[[WorldBatch], float]
 
 
 def best_scene(config: WorldConfig, seed: int, score: Score) -> WorldBatch:
-    """One world in the step of its FL-ORCA episode that scores highest, the first of several; a batch of one.
+    """The state of an FL-ORCA episode with the highest score, as a batch of one world.
 
-    The episode ends with its outcome; the starting state counts.
+    Of equal scores, the first counts. All states count, from the start to the one with the outcome.
     """
     worlds = WorldBatch(config, 1)
     worlds.seed([seed])
@@ -66,18 +66,18 @@ def best_scene(config: WorldConfig, seed: int, score: Score) -> WorldBatch:
 
 
 def robots_near(worlds: WorldBatch) -> float:
-    """How many robots the learning robot of world 0 senses, within R2."""
+    """Number of robots within R2 of the learning robot of world 0."""
     offset = _offsets(worlds)
     return float(np.sum(np.hypot(*offset.T) < worlds.config.outer_radius_m) - 1)
 
 
 def field_strength(worlds: WorldBatch) -> float:
-    """The length of u_apf of the learning robot of world 0, m/s."""
+    """Magnitude of u_apf of the learning robot of world 0, m/s."""
     return float(np.hypot(*potential_field(worlds)))
 
 
 def potential_field(worlds: WorldBatch) -> Vector:
-    """u_apf `[2]` of the learning robot of world 0, from all robots, m/s."""
+    """u_apf `[2]` of the learning robot of world 0, caused by all other robots, m/s."""
     state = worlds.state
     params = field_params(worlds.config)
     field = field_of(state.learner[0], 0, worlds.config.num_robots, state.pos_x[0], state.pos_y[0], params)
@@ -85,9 +85,9 @@ def potential_field(worlds: WorldBatch) -> Vector:
 
 
 def perceived(worlds: WorldBatch) -> NDArray[np.int64]:
-    """What M_sensor perceives in world 0, `[kinds, 2, sectors]`, the disc's first.
+    """M_sensor's counts in world 0, `[kinds, 2, sectors]` int64; on the second axis the disc, then the ring.
 
-    One kind, own less other robots, or both counts apart where `sensor_counts` says so.
+    One kind, own minus other robots; or two, own and other robots, if the config's `sensor_counts` is `separate`.
     """
     seen = np.zeros((worlds.num_worlds, *worlds.method.observation_shape), worlds.method.observation_dtype)
     worlds.method.perceive(worlds.state, np.ones(worlds.num_worlds, np.bool_), seen)
@@ -95,13 +95,13 @@ def perceived(worlds: WorldBatch) -> NDArray[np.int64]:
 
 
 def net_counts(worlds: WorldBatch) -> NDArray[np.int64]:
-    """Own less other robots of world 0 `[2, sectors]`, the disc's first."""
+    """Own minus other robots in world 0, `[2, sectors]` int64: the disc, then the ring."""
     counts = perceived(worlds)
     return np.array(counts[0] - counts[1:].sum(axis=0), np.int64)
 
 
 def group_ellipses(worlds: WorldBatch, config: WorldConfig) -> list[GroupEllipse]:
-    """(a, b, x_c, y_c, theta) of each group of world 0, as M_IN and M_OUT see them with the settings of `config`."""
+    """The ellipse of each group of world 0, as M_IN and M_OUT compute them with the settings of `config`."""
     params, state = ellipse_params(config), worlds.state
     left_out = left_out_of(state.learner[0], params)
     pos_x, pos_y = state.pos_x[0], state.pos_y[0]
@@ -109,7 +109,7 @@ def group_ellipses(worlds: WorldBatch, config: WorldConfig) -> list[GroupEllipse
 
 
 def sector_frame(worlds: WorldBatch) -> Vector:
-    """The rotation `[2, 2]` from the frame of the sectors of world 0 to the world's."""
+    """The rotation matrix `[2, 2]` from the frame of the sectors in world 0 to the world's frame."""
     if worlds.config.sector_frame == "world":
         return np.eye(2)
     own = int(worlds.state.group[worlds.state.learner[0]])
@@ -118,14 +118,14 @@ def sector_frame(worlds: WorldBatch) -> Vector:
 
 
 def executed_velocity(worlds: WorldBatch, action: int) -> Vector:
-    """The velocity `[2]` with which the learning robot of world 0 moves when the network says `action`, m/s."""
+    """The velocity `[2]` that the learning robot of world 0 executes for `action`, m/s."""
     out_x, out_y = np.zeros(worlds.num_worlds, np.float32), np.zeros(worlds.num_worlds, np.float32)
     worlds.method.velocity(worlds.state, np.full(worlds.num_worlds, action), out_x, out_y)
     return np.array([out_x[0], out_y[0]], np.float64)
 
 
 def diagram_3_1(world: WorldConfig) -> Figure:
-    """M_sensor's regions with the robots in them, and the state they make with the heading of the fullest sector."""
+    """M_sensor's regions with the robots in them, and the resulting state with the heading of the highest count."""
     worlds = best_scene(world, EPISODE_SEED, robots_near)
     counts = perceived(worlds)
     figure = new_figure(9.0, 5.0, f"Figure 3.1  What M_sensor perceives (step {int(worlds.state.steps[0])})")
@@ -146,7 +146,7 @@ def diagram_3_1(world: WorldConfig) -> Figure:
 
 
 def diagram_4_1(world: WorldConfig) -> Figure:
-    """The groups' ellipses with a, b and theta: as the text has them, and with the whole covariance."""
+    """The groups' ellipses with a, b and theta: without the covariance of x and y as in the text, and with it."""
     worlds = best_scene(world, EPISODE_SEED, robots_near)
     counted = "counted" if worlds.config.ellipse_counts_learner else "not counted"
     steps = int(worlds.state.steps[0])
@@ -166,7 +166,7 @@ def diagram_4_1(world: WorldConfig) -> Figure:
 
 
 def diagram_4_3(world: WorldConfig) -> Figure:
-    """M_OUT's velocity as the sum of the network's and the potential field's."""
+    """M_OUT's velocity as the sum of the network's velocity and the potential field's."""
     worlds = best_scene(world, EPISODE_SEED, field_strength)
     config = worlds.config
     action = _heading_to_group(worlds)
@@ -208,7 +208,7 @@ def _heading_to_group(worlds: WorldBatch) -> int:
 
 
 def _draw_robots(axes: Axes, worlds: WorldBatch, reach_m: float, opacity: float = 1.0) -> None:
-    """All robots in their true size with their group's number; the learning robot is black, in the origin."""
+    """Draws all robots to scale with their group's number; the learning robot is black and in the origin."""
     config, learner = worlds.config, int(worlds.state.learner[0])
     for robot, place in enumerate(_offsets(worlds)):
         group = int(worlds.state.group[robot])
@@ -222,7 +222,7 @@ def _draw_robots(axes: Axes, worlds: WorldBatch, reach_m: float, opacity: float 
 
 
 def _draw_regions(axes: Axes, config: WorldConfig, frame: Vector | None = None) -> None:
-    """Disc R1 and ring R1 … R2 with their radii, or both cut into sectors of a frame."""
+    """Draws disc R1 and ring R1 … R2: with their radii, or divided into the sectors of `frame`."""
     inner, outer = config.inner_radius_m, config.outer_radius_m
     if frame is None:
         axes.add_patch(Wedge((0, 0), outer, 0, 360, width=outer - inner, fc=RING, ec="none", zorder=0))
@@ -240,7 +240,7 @@ def _draw_regions(axes: Axes, config: WorldConfig, frame: Vector | None = None) 
 
 
 def _draw_counts(axes: Axes, config: WorldConfig, counts: NDArray[np.int64], frame: Vector) -> None:
-    """Each cell's count in its middle, or both with a bar between; `[kinds, 2, sectors]`."""
+    """Writes the counts `[kinds, 2, sectors]` into the regions of the sectors, two kinds as `own|other`."""
     middle_m = (0.62 * config.inner_radius_m, 0.5 * (config.inner_radius_m + config.outer_radius_m))
     centres = heading_velocities(config, np.float64)[: config.sectors] @ frame.T / config.learner_speed_m_s
     for region, radius_m in enumerate(middle_m):
@@ -258,7 +258,7 @@ def _count_text(count: NDArray[np.int64]) -> str:
 
 
 def _draw_ellipse(axes: Axes, found: GroupEllipse, learner: Vector, group: int) -> None:
-    """The ellipse with its half-axes from the centre: a dashed, b solid."""
+    """Draws an ellipse with its half-axes: a dashed, b solid."""
     a, b, x_c, y_c, theta = found
     colour = GROUP_COLOURS[group % len(GROUP_COLOURS)]
     centre = np.array([x_c, y_c]) - learner
@@ -273,7 +273,7 @@ def _draw_ellipse(axes: Axes, found: GroupEllipse, learner: Vector, group: int) 
 
 
 def _arrow(axes: Axes, tip: Vector, colour: str, width: float = 2.5) -> None:
-    """An arrow from the learning robot in the origin."""
+    """Draws an arrow from the learning robot, which is in the origin."""
     style: dict[str, Any] = {
         "arrowstyle": "-|>",
         "color": colour,
@@ -286,7 +286,7 @@ def _arrow(axes: Axes, tip: Vector, colour: str, width: float = 2.5) -> None:
 
 
 class Diagram(NamedTuple):
-    """A diagram: its file's name, what it shows in words, the method and setup whose world it takes, what draws it."""
+    """A diagram: its file name, its description, the method and setup of its world, and the function that draws it."""
 
     file: str
     alt: str

@@ -1,8 +1,8 @@
-"""Figures 3.2 and 3.3 of the dissertation: an episode that ends well among eight groups, one captured robot, one lost.
+"""Figures 3.2 and 3.3 of the dissertation: a success among eight groups, a captured robot, and a lost one.
 
-The worlds are those of the preset; a rule drives the learning robot, so that no trained policy is needed and anyone
-gets the same pictures: `greedy`, and `random` where it is to be lost, which `greedy` hardly is. Of the episodes with
-seeds from 0 on, the first with the wanted outcome is drawn.
+The worlds are those of the preset. A baseline drives the learning robot, so that the pictures need no trained policy
+and are the same everywhere: `greedy`, or `random` for the lost robot, because `greedy` hardly ever loses its group. The
+first episode with the wanted outcome is drawn, with seeds counted from 0.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from sim_core.config import WorldConfig
 from sim_core.outcomes import OUTCOME_NAMES, Outcome
 
 SEARCHED = 2_000
-"""So many episodes are played until one has the wanted outcome."""
+"""Episodes that are searched for the wanted outcome."""
 AT_ONCE = 250
 FRAMES = 5
 
 
-@functools.lru_cache(maxsize=32)  # reports of the same preset in one process draw the same
+@functools.lru_cache(maxsize=32)  # reports of one preset in one process draw the same episodes
 def first_episode(world: WorldConfig, rule: Baseline, outcome: Outcome) -> Episode | None:
-    """The first of `SEARCHED` episodes of the rule that ends so, None if none does."""
+    """The first of `SEARCHED` episodes of the baseline `rule` that ends in `outcome`; None if none does."""
     spec = EnvSpec(ENV_ID, world)
     for begin in range(0, SEARCHED, AT_ONCE):
         seeds = list(range(begin, begin + AT_ONCE))
@@ -43,7 +43,7 @@ def first_episode(world: WorldConfig, rule: Baseline, outcome: Outcome) -> Episo
 
 
 def draw_example(rule: Baseline, outcome: Outcome, world: WorldConfig) -> Figure:
-    """A strip of the first episode that ends so."""
+    """Draws a strip of the first episode with the outcome, or says that there is none."""
     episode = first_episode(world, rule, outcome)
     if episode is not None:
         return episode_strip(episode, world, FRAMES, f"Driven by the rule `{rule}`.")

@@ -1,4 +1,4 @@
-"""A few frames of one episode side by side, as the dissertation's Figure 3.2."""
+"""A strip of frames from one episode side by side, as in the dissertation's Figure 3.2."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from actors.evaluation.trajectory import Episode
+from dashboards.figures.style import DPI, MUTED, TEXT
 from sim_core.config import WorldConfig
 from sim_core.outcomes import OUTCOME_NAMES, Outcome
 from sim_core.render import draw_world
 
-DPI = 100
 FRAME_PX = 300
 GAP_PX = 10
 HEAD_PX, FOOT_PX = 34, 34
-TEXT, MUTED, SUCCESS, FAILURE = "#1C2024", "#5A6470", "#0A6B45", "#B3261E"
+SUCCESS, FAILURE = "#0A6B45", "#B3261E"
 
 
 def frame_steps(num_states: int, frames: int) -> NDArray[np.int64]:
@@ -27,7 +27,7 @@ def frame_steps(num_states: int, frames: int) -> NDArray[np.int64]:
 
 
 def episode_strip_png(episode: Episode, config: WorldConfig, path: Path, frames: int = 6) -> None:
-    """Writes `episode_strip` to a PNG, which is replaced if it exists.
+    """Writes `episode_strip` as PNG; an existing file is replaced.
 
     Raises:
       ValueError: fewer than 2 frames.
@@ -37,13 +37,13 @@ def episode_strip_png(episode: Episode, config: WorldConfig, path: Path, frames:
 
 
 def episode_strip(episode: Episode, config: WorldConfig, frames: int = 6, remark: str = "") -> Figure:
-    """The strip: the step above each frame, the outcome above the last.
+    """Draws the strip, with the step above each frame and the outcome above the last.
 
     Args:
       episode: T + 1 recorded states.
       config: the setup it was recorded in.
-      frames: how many frames, at least 2; fewer are drawn where there are fewer states.
-      remark: what else stands below.
+      frames: number of frames, at least 2; fewer are drawn if there are fewer states.
+      remark: a sentence to add to the caption below.
 
     Raises:
       ValueError: fewer than 2 frames.
@@ -55,17 +55,17 @@ def episode_strip(episode: Episode, config: WorldConfig, frames: int = 6, remark
     height_px = HEAD_PX + FRAME_PX + FOOT_PX
     figure = Figure(figsize=(width_px / DPI, height_px / DPI), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
-    for place, step in enumerate(steps):
-        left_px = GAP_PX + place * (FRAME_PX + GAP_PX)
+    for i, step in enumerate(steps):
+        left_px = GAP_PX + i * (FRAME_PX + GAP_PX)
         image = draw_world(episode.position[step], episode.goal, episode.learner, config, FRAME_PX)
         figure.figimage(_framed(image), xo=left_px, yo=FOOT_PX)
-        text, colour = _heading(int(step), episode, last=place == len(steps) - 1)
+        text, colour = _frame_title(int(step), episode, last=i == len(steps) - 1)
         _write(figure, left_px, height_px - HEAD_PX / 2, text, colour, weight="bold")
     _write(figure, GAP_PX, FOOT_PX / 2, f"{_caption(episode, config)} {remark}".rstrip(), MUTED, weight="normal")
     return figure
 
 
-def _heading(step: int, episode: Episode, last: bool) -> tuple[str, str]:
+def _frame_title(step: int, episode: Episode, last: bool) -> tuple[str, str]:
     if not last or episode.outcome == Outcome.RUNNING:
         return f"step {step}", TEXT
     colour = SUCCESS if episode.outcome == Outcome.GOAL else FAILURE
@@ -85,7 +85,7 @@ def _write(figure: Figure, x_px: float, y_px: float, text: str, colour: str, wei
 
 
 def _framed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """`image` `[height, width, 3]` in 16 levels a channel, half the bytes of 256, with a grey edge of one pixel."""
+    """`image` `[height, width, 3]` with 16 levels per channel, for half the bytes, and a grey edge of one pixel."""
     framed = (np.rint(image / 17.0) * 17.0).astype(np.uint8)
     for line in (framed[0], framed[-1], framed[:, 0], framed[:, -1]):
         line[...] = 0xD5

@@ -1,8 +1,9 @@
-"""The dissertation's result figures, redrawn from a table of results: 3.4 to 3.7, 4.4, 4.5, and a page of all numbers.
+"""The dissertation's result figures, redrawn from a table of results: 3.4 to 3.7, 4.4, 4.5, and a heat map.
 
-The arrangement is the dissertation's: Fixed beside Extrapolation (trained in the setup above the chart, tested in that
-on the x axis), one chart a robot count for the three methods. Axes start at the setup of the training, because
-Extrapolation goes to harder ones. Diamonds are the numbers that its text prints; its figures themselves are lost.
+They are arranged as in the dissertation: Fixed beside Extrapolation (trained in the setup named above the chart,
+tested in the setup on the x axis), and for the three methods one chart per robot count. The x axis starts at the setup
+of the training, because Extrapolation goes to harder setups. Diamonds mark the numbers printed in the dissertation's
+text; its figures are lost.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from matplotlib.figure import Figure
 
 from actors.evaluation.result_table import GROUPS, ROBOTS
 from dashboards.analysis.aggregate import (
-    Measure,
-    Measured,
+    Measurement,
+    Metric,
     Results,
     Setup,
     captured,
@@ -27,14 +28,14 @@ from dashboards.analysis.aggregate import (
     over_robots,
     success,
 )
+from dashboards.analysis.failure_styles import FAILURE_STYLES
 from dashboards.analysis.methods import method_label, method_style
-from dashboards.figures.bar_charts import Panel, Series, draw_bars, draw_lines, legend
-from dashboards.figures.learning_curve import FAILURE_STYLES
-from dashboards.figures.style import MUTED, TEXT, new_figure
+from dashboards.figures.bar_charts import Series, Subplot, draw_bars, draw_lines, legend
+from dashboards.figures.style import LINE_STYLES, MARKERS, MUTED, TEXT, new_figure
 
 FIXED_STYLE, TRANSFER_STYLE = ("#0072B2", "", "o"), ("#E69F00", "////", "s")
 HEAT_MAP, NO_CELL = "cividis", "#F0F0F0"
-PANEL_LETTERS = "abcdefgh"
+SUBPLOT_LETTERS = "abcdefgh"
 
 Printed = dict[int, float]
 MORE_ROBOTS_1G: dict[Setup, Printed] = {Setup(5, 1): {5: 1.0}, Setup(10, 1): dict.fromkeys(ROBOTS[1:], 0.85)}
@@ -51,7 +52,7 @@ MORE_GROUPS: dict[Setup, Printed] = {
     Setup(10, 2): {2: 0.9},
     Setup(10, 3): {},
 }
-"""Setups of the training, a panel each, and the Fixed success that the text prints, by the number on the x axis."""
+"""Training setups with one subplot each, and the Fixed success printed in the text, by the number on the x axis."""
 PRINTED_OUT: dict[int, Printed] = {5: {1: 1.0}, 20: {1: 1.0}, 25: {1: 1.0}}
 """M_OUT's success in Figure 4.4, by robots and groups."""
 PRINTED_LOST: Printed = {10: 0.04, 20: 0.08}
@@ -60,101 +61,103 @@ PRINTED_LOST: Printed = {10: 0.04, 20: 0.08}
 
 def figure_3_4(results: Results) -> Figure:
     """M_sensor trained on one group: more robots (a, b), more groups (c, d)."""
-    panels = [_more_robots(results, *item) for item in MORE_ROBOTS_1G.items()]
-    panels += [_more_groups(results, *item) for item in MORE_GROUPS_1G.items()]
-    return _transfer_figure("Figure 3.4  M_sensor trained on 1 group: success", panels)
+    subplots = [_more_robots(results, *item) for item in MORE_ROBOTS_1G.items()]
+    subplots += [_more_groups(results, *item) for item in MORE_GROUPS_1G.items()]
+    return _transfer_figure("Figure 3.4  M_sensor trained on 1 group: success", subplots)
 
 
 def figure_3_5(results: Results) -> Figure:
     """M_sensor trained on two or three groups: more robots."""
-    panels = [_more_robots(results, *item) for item in MORE_ROBOTS.items()]
-    return _transfer_figure("Figure 3.5  M_sensor trained on 2 or 3 groups: success with more robots", panels)
+    subplots = [_more_robots(results, *item) for item in MORE_ROBOTS.items()]
+    return _transfer_figure("Figure 3.5  M_sensor trained on 2 or 3 groups: success with more robots", subplots)
 
 
 def figure_3_6(results: Results) -> Figure:
     """M_sensor trained on two or three groups: more groups."""
-    panels = [_more_groups(results, *item) for item in MORE_GROUPS.items()]
-    return _transfer_figure("Figure 3.6  M_sensor trained on 2 or 3 groups: success with more groups", panels)
+    subplots = [_more_groups(results, *item) for item in MORE_GROUPS.items()]
+    return _transfer_figure("Figure 3.6  M_sensor trained on 2 or 3 groups: success with more groups", subplots)
 
 
-def _more_robots(results: Results, trained: Setup, printed: Printed) -> Panel:
+def _more_robots(results: Results, trained: Setup, printed: Printed) -> Subplot:
     played = [Setup(robots, trained.groups) for robots in ROBOTS if robots >= trained.robots]
-    return _transfer_panel(results, trained, played, {Setup(n, trained.groups): v for n, v in printed.items()})
+    return _transfer_subplot(results, trained, played, {Setup(n, trained.groups): v for n, v in printed.items()})
 
 
-def _more_groups(results: Results, trained: Setup, printed: Printed) -> Panel:
+def _more_groups(results: Results, trained: Setup, printed: Printed) -> Subplot:
     played = [Setup(trained.robots, groups) for groups in GROUPS if groups >= trained.groups]
-    return _transfer_panel(results, trained, played, {Setup(trained.robots, m): v for m, v in printed.items()})
+    return _transfer_subplot(results, trained, played, {Setup(trained.robots, m): v for m, v in printed.items()})
 
 
-def _transfer_panel(results: Results, trained: Setup, played: Sequence[Setup], printed: dict[Setup, float]) -> Panel:
+def _transfer_subplot(
+    results: Results, trained: Setup, played: Sequence[Setup], printed: dict[Setup, float]
+) -> Subplot:
     fixed = [measured(results.fixed("sensor", setup), success) for setup in played]
     foreign = [measured(results.transferred("sensor", trained, setup), success) for setup in played]
     places = {played.index(setup): value for setup, value in printed.items()}
-    return Panel(
+    return Subplot(
         title=f"Extrapolation trained on {trained}",
         labels=[str(setup) for setup in played],
         series=[Series("Fixed", *FIXED_STYLE, fixed, places), Series("Extrapolation", *TRANSFER_STYLE, foreign)],
     )
 
 
-def _transfer_figure(title: str, panels: list[Panel]) -> Figure:
+def _transfer_figure(title: str, subplots: list[Subplot]) -> Figure:
     figure = new_figure(9.0, 6.0, title)
-    panels = _lettered(panels)
-    for axes, panel in zip(figure.subplots(2, 2, sharey=True).flat, panels, strict=True):
-        draw_bars(axes, panel)
-    legend(figure, panels, lines=False)
+    subplots = _lettered(subplots)
+    for axes, subplot in zip(figure.subplots(2, 2, sharey=True).flat, subplots, strict=True):
+        draw_bars(axes, subplot)
+    legend(figure, subplots, lines=False)
     return figure
 
 
 def figure_3_7(results: Results) -> Figure:
     """M_sensor's lost and captured robots, by robots (a) and by groups (b)."""
-    causes: list[tuple[str, Measure]] = [("lost", lost), ("captured", captured)]
+    causes: list[tuple[str, Metric]] = [("lost", lost), ("captured", captured)]
     by_robots = [_cause(name, [over_groups(results, "sensor", n, cause) for n in ROBOTS]) for name, cause in causes]
     by_groups = [_cause(name, [over_robots(results, "sensor", m, cause) for m in GROUPS]) for name, cause in causes]
-    panels = [
-        Panel("by robots per group, mean of 1 to 8 groups", [f"{n}r" for n in ROBOTS], by_robots),
-        Panel("by groups, mean of 5 to 25 robots", [f"{m}g" for m in GROUPS], by_groups),
+    subplots = [
+        Subplot("by robots per group, mean of 1 to 8 groups", [f"{n}r" for n in ROBOTS], by_robots),
+        Subplot("by groups, mean of 5 to 25 robots", [f"{m}g" for m in GROUPS], by_groups),
     ]
-    return _line_figure("Figure 3.7  M_sensor: lost and captured, share of all episodes", panels)
+    return _line_figure("Figure 3.7  M_sensor: lost and captured, share of all episodes", subplots)
 
 
-def _cause(name: str, rates: list[Measured | None]) -> Series:
-    colour, line, marker = FAILURE_STYLES[name]
-    return Series(name, colour, line, marker, rates)
+def _cause(name: str, rates: list[Measurement | None]) -> Series:
+    style = FAILURE_STYLES[name]
+    return Series(name, style.colour, LINE_STYLES[style.dash], MARKERS[style.marker], rates)
 
 
 def figure_4_4(results: Results) -> Figure:
-    """The three methods, one chart a robot count."""
+    """The three methods, one chart per robot count."""
     figure = new_figure(9.0, 8.0, "Figure 4.4  Success of the three methods")
-    panels = _lettered([_methods_panel(results, robots) for robots in ROBOTS])
+    subplots = _lettered([_methods_subplot(results, robots) for robots in ROBOTS])
     *charts, rest = figure.subplots(3, 2, sharey=True).flat
-    for axes, panel in zip(charts, panels, strict=True):
-        draw_bars(axes, panel)
-    legend(figure, panels, lines=False, place=rest)
+    for axes, subplot in zip(charts, subplots, strict=True):
+        draw_bars(axes, subplot)
+    legend(figure, subplots, lines=False, axes=rest)
     return figure
 
 
-def _methods_panel(results: Results, robots: int) -> Panel:
+def _methods_subplot(results: Results, robots: int) -> Subplot:
     series = []
     for method in results.methods():
         rates = [measured(results.fixed(method, Setup(robots, groups)), success) for groups in GROUPS]
         printed = PRINTED_OUT.get(robots, {}) if method == "out" else {}
         places = {GROUPS.index(groups): value for groups, value in printed.items()}
         series.append(Series(method_label(method), *method_style(method)[:3], rates, places))
-    return Panel(f"{robots} robots per group", [f"{groups}g" for groups in GROUPS], series)
+    return Subplot(f"{robots} robots per group", [f"{groups}g" for groups in GROUPS], series)
 
 
 def figure_4_5(results: Results) -> Figure:
     """Captured (a) and lost (b) robots of M_sensor and M_OUT, by robots."""
-    panels = [
-        Panel(f"{name}, mean of 1 to 8 groups", [f"{n}r" for n in ROBOTS], _two_methods(results, cause, printed))
+    subplots = [
+        Subplot(f"{name}, mean of 1 to 8 groups", [f"{n}r" for n in ROBOTS], _two_methods(results, cause, printed))
         for name, cause, printed in (("captured", captured, {}), ("lost", lost, PRINTED_LOST))
     ]
-    return _line_figure("Figure 4.5  M_sensor and M_OUT: captured and lost, share of all episodes", panels)
+    return _line_figure("Figure 4.5  M_sensor and M_OUT: captured and lost, share of all episodes", subplots)
 
 
-def _two_methods(results: Results, cause: Measure, printed: Printed) -> list[Series]:
+def _two_methods(results: Results, cause: Metric, printed: Printed) -> list[Series]:
     places = {ROBOTS.index(robots): value for robots, value in printed.items()}
     series = []
     for method, line in (("sensor", "-"), ("out", "--")):
@@ -164,35 +167,38 @@ def _two_methods(results: Results, cause: Measure, printed: Printed) -> list[Ser
     return series
 
 
-def _line_figure(title: str, panels: list[Panel]) -> Figure:
+def _line_figure(title: str, subplots: list[Subplot]) -> Figure:
     figure = new_figure(9.0, 3.6, title)
-    panels = _lettered(panels)
-    limits = [rate.estimate.high for panel in panels for one in panel.series for rate in one.rates if rate is not None]
-    limits += [value for panel in panels for one in panel.series for value in one.printed.values()]
+    subplots = _lettered(subplots)
+    limits = [
+        rate.estimate.high for subplot in subplots for one in subplot.series for rate in one.rates if rate is not None
+    ]
+    limits += [value for subplot in subplots for one in subplot.series for value in one.printed.values()]
     top = max(1.1 * max(limits, default=0.0), 0.05)
-    for axes, panel in zip(figure.subplots(1, 2, sharey=True).flat, panels, strict=True):
-        draw_lines(axes, panel, top)
-    legend(figure, panels[::-1], lines=True)
+    for axes, subplot in zip(figure.subplots(1, 2, sharey=True).flat, subplots, strict=True):
+        draw_lines(axes, subplot, top)
+    legend(figure, subplots[::-1], lines=True)
     return figure
 
 
-def _lettered(panels: list[Panel]) -> list[Panel]:
+def _lettered(subplots: list[Subplot]) -> list[Subplot]:
     return [
-        panel._replace(title=f"({letter}) {panel.title}") for letter, panel in zip(PANEL_LETTERS, panels, strict=False)
+        subplot._replace(title=f"({letter}) {subplot.title}")
+        for letter, subplot in zip(SUBPLOT_LETTERS, subplots, strict=False)
     ]
 
 
 def heatmap(results: Results) -> Figure:
-    """Fixed success of every cell in percent, with its 95 % interval below."""
+    """Fixed success of every cell in percent, each with its 95 % interval below."""
     methods = results.methods()
     figure = new_figure(10.0 * len(methods) / 3, 4.0, "Success of all Fixed setups in percent, 95 % intervals below")
     for axes, method in zip(figure.subplots(1, len(methods)), methods, strict=True):
-        _heat_panel(axes, results, method)
+        _draw_heatmap(axes, results, method)
         axes.set_title(method_label(method), loc="left", fontsize=10, color=TEXT)
     return figure
 
 
-def _heat_panel(axes: Axes, results: Results, method: str) -> None:
+def _draw_heatmap(axes: Axes, results: Results, method: str) -> None:
     rates = [[measured(results.fixed(method, Setup(n, m)), success) for m in GROUPS] for n in ROBOTS]
     shares = np.array([[np.nan if rate is None else rate.estimate.value for rate in line] for line in rates])
     axes.set_facecolor(NO_CELL)
@@ -206,7 +212,7 @@ def _heat_panel(axes: Axes, results: Results, method: str) -> None:
     axes.spines[:].set_visible(False)
 
 
-def _write_cell(axes: Axes, column: int, row: int, rate: Measured | None) -> None:
+def _write_cell(axes: Axes, column: int, row: int, rate: Measurement | None) -> None:
     if rate is None:
         axes.text(column, row, "–", ha="center", va="center", color=MUTED)
         return
@@ -217,7 +223,7 @@ def _write_cell(axes: Axes, column: int, row: int, rate: Measured | None) -> Non
 
 
 class Picture(NamedTuple):
-    """A result figure: its file's name, what it shows in words, and what draws it."""
+    """A figure of results: its file name, its description, and the function that draws it."""
 
     file: str
     alt: str

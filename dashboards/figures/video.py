@@ -1,4 +1,4 @@
-"""Episodes as MP4 films."""
+"""Episodes as MP4 videos."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim_core.config import WorldConfig
 from sim_core.render import draw_world
 
 CRF = "20"
-"""x264's constant quality: 18 looks lossless, 23 is its default, larger is smaller and worse."""
+"""x264's constant rate factor: 18 looks lossless, 23 is the default; larger values give smaller, worse videos."""
 
 
 def check_video_packages() -> None:
@@ -25,18 +25,18 @@ def check_video_packages() -> None:
 
 
 def episode_frames(episode: Episode, config: WorldConfig, size_px: int = 480) -> Iterator[NDArray[np.uint8]]:
-    """The T + 1 states of `episode`, each drawn as `[size_px, size_px, 3]` uint8 RGB."""
+    """Draws the T + 1 states of `episode`, each as `[size_px, size_px, 3]` uint8 RGB."""
     for position in episode.position:
         yield draw_world(position, episode.goal, episode.learner, config, size_px)
 
 
 def write_mp4(frames: Iterable[NDArray[np.uint8]], path: Path, frames_per_s: float) -> None:
-    """Writes an H.264 film that every browser plays (yuv420p); `path` appears once the film is whole.
+    """Writes an H.264 video that every browser plays (yuv420p); `path` appears once the video is complete.
 
     Args:
-      frames: `[height, width, 3]` uint8 RGB, all of one shape; an odd edge is made even by repeating its last line.
-      path: ends in `.mp4`; an older file there is replaced.
-      frames_per_s: for simulated time, 1 / time_step_s.
+      frames: `[height, width, 3]` uint8 RGB, all of one shape; an odd height or width is padded by one line.
+      path: ends in `.mp4`; an existing file is replaced.
+      frames_per_s: 1 / time_step_s plays at the speed of simulated time.
 
     Raises:
       ValueError: there are no frames, they differ in shape or are not uint8, or `path` does not end in `.mp4`.
@@ -52,7 +52,7 @@ def write_mp4(frames: Iterable[NDArray[np.uint8]], path: Path, frames_per_s: flo
 
 
 def _encode(frames: Iterable[NDArray[np.uint8]], path: Path, frames_per_s: float) -> None:
-    """Writes the film at once to `path`, where a broken one stays if `frames` raises."""
+    """Writes the video to `path` directly; an incomplete file stays there if `frames` raises."""
     import imageio_ffmpeg  # optional
 
     source = iter(frames)

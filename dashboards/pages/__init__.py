@@ -1,1 +1,1 @@
-"""Web pages: the report, the episode player, the local server."""
+"""Web pages: the report, the episode player, and the local server."""

@@ -1,20 +1,22 @@
-"""Web pages made of the files in `dashboards/web`: one self-contained document, nothing fetched from elsewhere."""
+"""Builds self-contained HTML documents from the files in `dashboards/web`; they load nothing from elsewhere."""
 
 from __future__ import annotations
 
 import base64
+import html
 import json
 import re
 import zlib
+from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
 OFFLINE = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data: blob:"
-"""Content security policy of a page that opens from disk: it can reach nothing."""
+"""Content security policy of a page opened from disk: it may connect to nothing."""
 SERVED = f"{OFFLINE}; connect-src 'self'"
-"""That of a page that asks the server it came from for newer data."""
+"""Content security policy of a served page: it may connect to its own server alone."""
 PLAYER_CSS = ("base.css", "player.css")
-PLAYER_JS = ("inflate.js", "player.js", "draw.js", "orca.js")
+PLAYER_JS = ("dom.js", "inflate.js", "player.js", "draw.js", "orca.js")
 
 
 def asset(name: str) -> str:
@@ -23,25 +25,44 @@ def asset(name: str) -> str:
 
 
 def assets(*names: str) -> str:
-    """Several files, one after the other."""
+    """The texts of several files, concatenated."""
     return "".join(asset(name) for name in names)
 
 
-def fill(template: str, fields: dict[str, str]) -> str:
-    """The file `template` with every `{{name}}` replaced, once: what is put in is not searched again."""
-    return re.sub(r"\{\{([a-z-]+)\}\}", lambda match: fields[match[1]], asset(template))
+def document(title: str, policy: str, css: Sequence[str], body: str, **fields: str) -> str:
+    """An HTML document.
+
+    Args:
+      title: plain text; it is escaped.
+      policy: content security policy.
+      css: files of its style.
+      body: file of its body, a template.
+      **fields: HTML of the body's fields, in addition to `title`.
+    """
+    escaped = html.escape(title)
+    content = _filled(body, title=escaped, **fields)
+    return _filled("document.html", title=escaped, policy=html.escape(policy), css=assets(*css), body=content)
+
+
+def _filled(template: str, **fields: str) -> str:
+    """The file `template` with every `{{name}}` replaced by its field; the fields themselves are not searched."""
+    return re.sub(r"\{\{([a-z]+)\}\}", lambda match: fields[match[1]], asset(template))
 
 
 def embedded(values: Any) -> str:
-    """JSON that may stand inside a script element."""
+    """JSON, escaped for a script element."""
     return to_json(values).replace("<", "\\u003c")
 
 
 def to_json(values: Any) -> str:
-    """Compact JSON; what JSON cannot say, such as NaN, is refused."""
+    """Compact JSON.
+
+    Raises:
+      ValueError: a number is not finite, which JSON cannot express.
+    """
     return json.dumps(values, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
 def packed(data: bytes) -> str:
-    """Bytes as `inflate.js` takes them: zlib, then base64."""
+    """Bytes in the form that `inflate.js` reads: compressed by zlib, then base64."""
     return base64.b64encode(zlib.compress(data, 9)).decode("ascii")

@@ -1,29 +1,30 @@
-"""One episode as one HTML file: a canvas player that needs no network and no framework.
+"""The episode player: one episode as one HTML file with a canvas, without network or framework.
 
-The file works from disk and inside an iframe. Positions travel as steps between states, in units of half a millimetre
-or more, packed; a velocity is the step between two positions, so none is stored.
+The file works from disk and inside an iframe. Positions are stored compressed, as differences between successive
+states in units of half a millimetre or more. Velocities are not stored: they are the same differences per time step.
 """
 
 from __future__ import annotations
 
-import html
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.evaluation.trajectory import Episode
-from dashboards.pages.assets import OFFLINE, PLAYER_CSS, PLAYER_JS, assets, embedded, fill, packed
+from dashboards.pages.assets import OFFLINE, PLAYER_CSS, PLAYER_JS, assets, document, embedded, packed
 from sim_core.config import WorldConfig
 from sim_core.outcomes import OUTCOME_NAMES, Outcome
 from sim_core.render import GROUP_COLOURS, view_half_m
 from sim_core.scenes.base import GOAL_HALF_SIDE_M
 from sim_core.swarm.flock_rules import STATE_NAMES
 
+if TYPE_CHECKING:
+    from actors.evaluation.trajectory import Episode
+
 INT16_MAX = 32767
 SMALLEST_UNIT_M = 0.0005
-"""Positions are no finer than this: a velocity is then exact to 0.01 m/s at a time step of 0.05 s."""
+"""Smallest unit of positions; with it, velocities are exact to 0.01 m/s at a time step of 0.05 s."""
 VERDICTS = {
     Outcome.RUNNING: "Cut: the recording stops before the episode ended",
     Outcome.GOAL: "Success: the group reached its goal",
@@ -32,7 +33,7 @@ VERDICTS = {
     Outcome.COLLISION: "Failure, collision: it touched another robot",
     Outcome.TIMEOUT: "Failure, timeout: the group did not reach its goal in time",
 }
-"""What an outcome means for the learning robot, in words."""
+"""Each outcome as a sentence about the learning robot."""
 
 
 def player_html(episode: Episode, config: WorldConfig, title: str) -> str:
@@ -44,43 +45,46 @@ def player_html(episode: Episode, config: WorldConfig, title: str) -> str:
       title: plain text; it is escaped.
 
     Returns:
-      A whole HTML document.
+      An HTML document.
 
     Raises:
-      ValueError: the positions are not finite, or are not of `config.num_robots` robots.
+      ValueError: the positions are not finite, or not those of `config.num_robots` robots.
     """
     return player_page(title, player_data(episode, config), "player_page.js", OFFLINE)
 
 
 def player_page(title: str, data: dict[str, Any], script: str, policy: str) -> str:
-    """A document with the player and one more script of `dashboards/web` that says what is played.
+    """A document with the player, and a script that loads the episodes to play.
 
     Args:
       title: plain text; it is escaped.
-      data: what the script finds in the element `data`.
-      script: the file's name.
+      data: JSON for the script, in the element `data`.
+      script: name of the script's file in `dashboards/web`.
       policy: content security policy.
     """
-    fields = {
-        "title": html.escape(title),
-        "policy": html.escape(policy),
-        "css": assets(*PLAYER_CSS),
-        "stage": assets("stage.html"),
-        "js": assets(*PLAYER_JS, script),
-        "data": embedded(data),
-    }
-    return fill("player.html", fields)
+    return document(
+        title,
+        policy,
+        (*PLAYER_CSS, "player_page.css"),
+        "player.html",
+        stage=assets("stage.html"),
+        data=embedded(data),
+        js=assets(*PLAYER_JS, script),
+    )
 
 
 def player_data(episode: Episode, config: WorldConfig) -> dict[str, Any]:
-    """What the player draws, ready for JSON.
+    """An episode as the player reads it, ready for JSON.
 
-    `positions` holds differences from state to state `[T + 1, num_robots, 2]` (the first from 0), int16 modulo 2^16 in
-    units of `metres_per_unit`, as two planes of bytes, the low ones first; `machine` `[T + 1, num_robots]` uint8
-    (sim_core.swarm.flock_rules.STATE_NAMES) and `actions` `[T + 1]` int8; all three packed (web_assets.packed).
+    Three arrays are packed (`dashboards.pages.assets.packed`):
+
+    - `positions` `[T + 1, num_robots, 2]` int16: differences from state to state, the first from 0, modulo 2^16, in
+      units of `metres_per_unit`; all low bytes come before all high bytes.
+    - `machine` `[T + 1, num_robots]` uint8: states of the FL-ORCA machine (`sim_core.swarm.flock_rules.STATE_NAMES`).
+    - `actions` `[T + 1]` int8: the learning robot's actions.
 
     Raises:
-      ValueError: the positions are not finite, or are not of `config.num_robots` robots.
+      ValueError: the positions are not finite, or not those of `config.num_robots` robots.
     """
     position = np.asarray(episode.position, np.float64)
     if position.ndim != 3 or position.shape[1:] != (config.num_robots, 2) or not np.isfinite(position).all():
@@ -107,7 +111,7 @@ def player_data(episode: Episode, config: WorldConfig) -> dict[str, Any]:
 
 
 def _scene(config: WorldConfig) -> dict[str, Any]:
-    """What the player knows of a setup."""
+    """The setup's settings that the player uses."""
     scale = math.sqrt(config.ellipse_chi_square)
     ellipse = {
         "full": config.ellipse_covariance == "full",
@@ -143,6 +147,6 @@ def _scene(config: WorldConfig) -> dict[str, Any]:
 
 
 def _byte_planes(units: NDArray[np.int16]) -> bytes:
-    """Differences along the first axis, modulo 2^16, all low bytes before all high bytes: they pack to a third."""
+    """Differences along the first axis, modulo 2^16; low bytes before high bytes, which compresses them to a third."""
     differences = np.diff(units, axis=0, prepend=np.zeros_like(units[:1])).astype("<i2")
     return differences.view(np.uint8).reshape(-1, 2).T.tobytes()

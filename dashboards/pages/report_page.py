@@ -1,35 +1,44 @@
-"""The HTML report: one self-contained page with charts, claims and an episode player, from disk or served.
+"""The HTML report: one self-contained page with charts, claims and an episode player, opened from disk or served.
 
-What the page shows is data (`report_data`); the page itself (`report_page`) is the same for every report. Plotly's
-JavaScript travels inside, packed, so that nothing is fetched.
+`report_data` turns a report's contents into data; `report_page` embeds them in a page that is the same for all reports.
+Plotly's JavaScript is embedded compressed, so that nothing is loaded from elsewhere.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
-import html
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from dashboards.analysis.claim_checks import Claim
 from dashboards.analysis.claim_text import DETAILS, NOTE, detail_row, evidence, tally
 from dashboards.analysis.methods import in_order, method_label
-from dashboards.pages.assets import OFFLINE, PLAYER_CSS, PLAYER_JS, SERVED, assets, embedded, fill, packed, to_json
+from dashboards.pages.assets import (
+    OFFLINE,
+    PLAYER_CSS,
+    PLAYER_JS,
+    SERVED,
+    assets,
+    document,
+    embedded,
+    packed,
+    to_json,
+)
 from dashboards.plotly_charts.chart import Chart, Table, as_json, plotly_js
 from dashboards.plotly_charts.result_charts import FAVOURITE
 
 REFRESH_S = 4
-"""A served page asks for newer data this often."""
+"""Interval at which a served page requests newer data."""
 FIRST, LAST = ("running", "success", "claims"), ("transfer", "failures", "curves", "throughput")
-"""The sections of a report, from top to bottom: tables of other names stand between, the episodes come last."""
+"""First and last sections of a report; other tables come between, and the episodes at the end."""
 
 
 class EpisodeGroup(NamedTuple):
     """The episodes of one policy in one setup.
 
-    `key` names the group; `policy` is `learned` or a baseline's name; `trained`, `played` setups and `seed` the
-    training's, as text; `counts` the episodes there are by outcome.
+    `key` identifies the group. `policy` is `learned` or a baseline's name. `trained` and `played` are the setups of
+    the training and of the test, and `seed` is the training's, all as text. `counts` are episodes by outcome.
     """
 
     key: str
@@ -42,8 +51,8 @@ class EpisodeGroup(NamedTuple):
     counts: dict[str, int]
 
 
-class TablePart(NamedTuple):
-    """A section that is a table; it is left out while the table has no rows."""
+class TableSection(NamedTuple):
+    """A section with a table; it is hidden while the table has no rows."""
 
     key: str
     title: str
@@ -51,11 +60,11 @@ class TablePart(NamedTuple):
     table: Table
 
 
-class Contents(NamedTuple):
-    """What a report says.
+class ReportContents(NamedTuple):
+    """The contents of a report.
 
-    Fields: its title, a line below it, and how it was made; facts as (name, value); charts; judged claims by preset;
-    tables; the episodes to choose from and a note on them.
+    Fields: its title, the line below it, and how it was made; facts as (name, value); charts; judged claims by preset;
+    tables; the groups of episodes, and a note on them.
     """
 
     title: str
@@ -64,24 +73,24 @@ class Contents(NamedTuple):
     facts: list[tuple[str, str]]
     charts: list[Chart]
     claims: Mapping[str, Sequence[Claim]]
-    tables: list[TablePart]
+    tables: list[TableSection]
     groups: list[EpisodeGroup]
     episodes_note: str
 
 
-def report_data(contents: Contents) -> dict[str, Any]:
-    """The contents as the page takes them; `stamp` changes whenever anything else does."""
+def report_data(contents: ReportContents) -> dict[str, Any]:
+    """The contents as the page reads them, ready for JSON; `stamp` changes with any other value."""
     data = {
         "subtitle": contents.subtitle,
         "made": contents.made,
         "facts": contents.facts,
-        "order": [*FIRST, *(part.key for part in contents.tables if part.key not in FIRST), *LAST],
+        "order": [*FIRST, *(section.key for section in contents.tables if section.key not in FIRST), *LAST],
         "methods": {name: method_label(name) for name in in_order(group.method for group in contents.groups)},
         "favourite": str(FAVOURITE),
         "charts": [as_json(chart) for chart in contents.charts],
         "claims_note": NOTE.replace("\n", " ").replace("*", "").replace("`", ""),
         "claims": [_judged(preset, claims) for preset, claims in contents.claims.items()],
-        "tables": [{**part._asdict(), "table": part.table._asdict()} for part in contents.tables],
+        "tables": [{**section._asdict(), "table": section.table._asdict()} for section in contents.tables],
         "episodes": {"groups": [group._asdict() for group in contents.groups], "note": contents.episodes_note},
     }
     return {**data, "stamp": hashlib.sha256(to_json(data).encode()).hexdigest()[:16]}
@@ -108,22 +117,22 @@ def report_page(title: str, data: Mapping[str, Any], samples: Mapping[str, Any],
     Args:
       title: plain text; it is escaped.
       data: of `report_data`.
-      samples: episodes that travel with the page, as `dashboards.pages.player.player_data` gives them, by
-        `GROUP|outcome|number`, numbers from 0.
-      live: whether the page is served, and asks for newer data and episodes; else it can reach nothing.
+      samples: embedded episodes as from `dashboards.pages.player.player_data`, by `GROUP|outcome|number`, numbers
+        from 0.
+      live: whether the page is served, and requests newer data and episodes; otherwise it may connect to nothing.
     """
-    fields = {
-        "title": html.escape(title),
-        "policy": html.escape(SERVED if live else OFFLINE),
-        "refresh": str(REFRESH_S if live else 0),
-        "css": assets(*PLAYER_CSS, "report.css"),
-        "stage": assets("stage.html"),
-        "plotly": _plotly(),
-        "data": packed(to_json(data).encode()),
-        "samples": embedded(samples),
-        "js": assets(*PLAYER_JS, "charts.js", "report.js", "episodes.js"),
-    }
-    return fill("report.html", fields)
+    return document(
+        title,
+        SERVED if live else OFFLINE,
+        (*PLAYER_CSS, "report.css"),
+        "report.html",
+        refresh=str(REFRESH_S if live else 0),
+        stage=assets("stage.html"),
+        plotly=_plotly(),
+        data=packed(to_json(data).encode()),
+        samples=embedded(samples),
+        js=assets(*PLAYER_JS, "charts.js", "report.js", "episodes.js"),
+    )
 
 
 @functools.cache

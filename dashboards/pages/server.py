@@ -1,4 +1,4 @@
-"""Serves a page and the data that it asks for, on this machine alone."""
+"""Serves a page and its data to browsers on this machine."""
 
 from __future__ import annotations
 
@@ -17,21 +17,29 @@ from sim_core.checks import ConfigError
 HOST = "127.0.0.1"
 Query = Mapping[str, str]
 Answer = Callable[[Query], Any]
-"""Makes what a path answers from the query: text is HTML, anything else becomes JSON.
+"""Answers a request from its query: a string is sent as HTML, anything else as JSON.
 
-A LookupError (nothing there), a ConfigError, a ValueError and an OSError become an answer that says so.
+A LookupError is answered by 404, a ConfigError, ValueError or OSError by 409, each with its message as JSON.
 """
+
+
+def episode_number(query: Query) -> int:
+    """The number of the episode that a page requests; raises LookupError if it is none."""
+    text = query.get("number", "")
+    if not text.isdecimal():
+        raise LookupError(f"episode {text!r}")
+    return int(text)
 
 
 class PageServer:
     """An HTTP server on 127.0.0.1.
 
-    Requests are answered one at a time, so that what answers need not be thread-safe. Requests that come under another
-    host's name are refused: a page from elsewhere cannot read the data by pointing its own name here.
+    Requests are answered one at a time, so that answers need not be thread-safe. Requests with another Host header are
+    refused: otherwise a foreign page could read the data by pointing its own host name to 127.0.0.1 (DNS rebinding).
 
     Args:
-      answers: what each path answers, such as `/` and `/data.json`.
-      port: where to listen; 0 takes a free one.
+      answers: the answer of each path, such as `/` and `/data.json`.
+      port: the port to listen on; 0 takes a free one.
 
     Raises:
       ConfigError: the port is taken.
@@ -54,28 +62,28 @@ class PageServer:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         return f"http://{HOST}:{self._server.server_port}/"
 
     def serve(self) -> None:
-        """Answers until `close` or an interrupt."""
+        """Answers requests until `close` is called or Ctrl-C."""
         self._server.serve_forever(poll_interval=0.2)
 
     def close(self) -> None:
-        """Ends `serve` in another thread and frees the port."""
+        """Ends `serve`, which runs in another thread, and frees the port."""
         self._server.shutdown()
         self._server.server_close()
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """GET alone, a connection a request; what it answers is in the subclass that the server makes."""
+    """Handles GET requests, one per connection; the server's subclass answers them."""
 
     def answer(self, path: str, query: Query) -> Any:
-        """What a path answers."""
+        """The answer to a request; see `Answer`."""
         raise NotImplementedError
 
     def do_GET(self) -> None:
-        """Answers a request."""
+        """Sends the answer, or an error as JSON."""
         host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
         if host not in (HOST, "localhost"):
             return self._send(HTTPStatus.FORBIDDEN, {"error": f"this server is {HOST}, not {host}"})
@@ -105,8 +113,8 @@ class _Handler(BaseHTTPRequestHandler):
         for name, value in headers.items():
             self.send_header(name, value)
         self.end_headers()
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the reader has gone
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the browser has closed the connection
             self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Says nothing: a page that refreshes would fill the terminal."""
+        """Logs nothing: a page that refreshes would fill the terminal."""

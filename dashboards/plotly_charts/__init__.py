@@ -1,1 +1,1 @@
-"""Interactive charts by Plotly."""
+"""Interactive charts of the HTML report, drawn by Plotly."""

@@ -1,6 +1,7 @@
-"""Charts of the HTML report as data: Plotly figures whose colours are names of the page's own, and tables of numbers.
+"""The data of the HTML report's charts: Plotly figures, their tables of numbers, and the choices a reader has.
 
-A colour is written `--name`, a CSS variable in `web/base.css`; the page puts the light or the dark value in its place.
+Colours are written `--name`, after the CSS variables in `web/base.css`. The page replaces them by the values of its
+light or dark scheme.
 """
 
 from __future__ import annotations
@@ -11,28 +12,21 @@ from typing import Any, NamedTuple
 from plotly.offline import get_plotlyjs
 
 from actors.evaluation.statistics import as_percent
-from dashboards.analysis.aggregate import Measured
+from dashboards.analysis.aggregate import Measurement
 
 Figure = dict[str, Any]
 """A Plotly figure: `data` and `layout`."""
-FAILURES = {
-    "lost": ("--lost", "", "solid", "circle"),
-    "captured": ("--captured", "/", "dash", "square"),
-    "collision": ("--collision", "x", "dashdot", "triangle-up"),
-    "timeout": ("--timeout", ".", "dot", "diamond"),
-}
-"""Colour, pattern, line and marker of each way to fail, so that none is told by its colour alone."""
 
 
 class Table(NamedTuple):
-    """The numbers of a figure, as text; the first column names the row."""
+    """A table as text; the first column names the row."""
 
     header: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
 
 
 class Panel(NamedTuple):
-    """One figure with what stands above it; `wide` asks for the whole row."""
+    """One figure with its title; a `wide` one takes the whole width of the page."""
 
     title: str
     figure: Figure
@@ -40,7 +34,7 @@ class Panel(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """What the reader may choose: its name, the options as (value, label), and the value to start with."""
+    """A select: its name and label, its options as (value, label), and its initial value."""
 
     name: str
     label: str
@@ -49,14 +43,14 @@ class Choice(NamedTuple):
 
 
 class View(NamedTuple):
-    """What a chart shows for one choice of everything."""
+    """What a chart shows for one combination of choices."""
 
     panels: list[Panel]
     table: Table
 
 
 class Chart(NamedTuple):
-    """One section of the report: `views` by the values of its choices, joined by `|`."""
+    """One section of the report. `views` are by the values of all choices, joined by `|`."""
 
     key: str
     title: str
@@ -66,12 +60,12 @@ class Chart(NamedTuple):
 
 
 def plotly_js() -> str:
-    """Plotly's own JavaScript, for a page that carries it inside."""
+    """Plotly's JavaScript, to be embedded in a page."""
     return str(get_plotlyjs())
 
 
 def as_json(chart: Chart) -> dict[str, Any]:
-    """The chart as the page takes it."""
+    """The chart, ready for JSON."""
     views = {
         key: {"panels": [panel._asdict() for panel in view.panels], "table": view.table._asdict()}
         for key, view in chart.views.items()
@@ -79,13 +73,13 @@ def as_json(chart: Chart) -> dict[str, Any]:
     return {**chart._asdict(), "choices": [choice._asdict() for choice in chart.choices], "views": views}
 
 
-def percent_text(measured: Measured | None) -> str:
+def percent_text(measured: Measurement | None) -> str:
     """`89.8 % (87.8 … 91.5)`, `–` without data."""
     return "–" if measured is None else as_percent(measured.estimate)
 
 
 def layout(**changes: Any) -> dict[str, Any]:
-    """What all figures share; fonts and the colours of axes come from the page."""
+    """The layout that all figures share, with some changes. The page adds fonts and the colours of axes."""
     return {
         "margin": {"l": 48, "r": 12, "t": 8, "b": 40},
         "height": 300,
@@ -100,8 +94,8 @@ def share_axis(top: float = 1.0, **changes: Any) -> dict[str, Any]:
     return {"range": [0.0, top * 1.04], "tickformat": ".0%", "rangemode": "tozero", "fixedrange": True, **changes}
 
 
-def error_bars(rates: Sequence[Measured]) -> dict[str, Any]:
-    """Plotly's error bars from each value to the limits of its interval."""
+def error_bars(rates: Sequence[Measurement]) -> dict[str, Any]:
+    """Plotly's error bars: the interval of each rate."""
     return {
         "type": "data",
         "symmetric": False,
@@ -114,6 +108,6 @@ def error_bars(rates: Sequence[Measured]) -> dict[str, Any]:
 
 
 def patterned(colour: str, pattern: str) -> dict[str, Any]:
-    """A bar's fill: a colour, with a pattern in the colour of the page on it."""
+    """A bar's marker: a colour, under a pattern in the colour of the page."""
     shape = {"shape": pattern, "fillmode": "overlay", "fgcolor": "--page", "fgopacity": 0.8, "size": 7, "solidity": 0.2}
     return {"color": colour, "pattern": shape}

@@ -1,4 +1,4 @@
-"""Charts of a table of results: success of every cell, Fixed against Extrapolation, and why episodes fail."""
+"""Charts of a table of results: success of every cell, Fixed beside Extrapolation, and causes of failure."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from plotly.colors import sample_colorscale
 
 from actors.evaluation.result_table import GROUPS, ROBOTS
 from actors.evaluation.statistics import as_percent
-from dashboards.analysis.aggregate import SETUPS, Measured, Results, Setup, measured, success
+from dashboards.analysis.aggregate import SETUPS, Measurement, Results, Setup, measured, success
+from dashboards.analysis.failure_styles import FAILURE_STYLES
 from dashboards.analysis.methods import in_order, method_label
 from dashboards.plotly_charts.chart import (
-    FAILURES,
     Chart,
     Choice,
     Figure,
@@ -27,32 +27,33 @@ from dashboards.plotly_charts.chart import (
 )
 from sim_core.outcomes import OUTCOME_NAMES, Outcome
 
-NAMED = {name: Outcome(number) for number, name in enumerate(OUTCOME_NAMES)}
+OUTCOMES = {name: Outcome(number) for number, name in enumerate(OUTCOME_NAMES)}
+"""Outcomes by name."""
 FAVOURITE = Setup(10, 2)
-"""The setup that charts show first, where it has data."""
-INTERVALS = "Brackets are 95 % intervals (Wilson's, widened by what seeds differ)."
+"""The setup that charts show first, if it has data."""
+INTERVALS = "Brackets are 95 % intervals (Wilson's, widened by the variation between seeds)."
 HEAT = "Cividis"
-"""Colour scale of shares; the same to people who do not tell red from green."""
+"""Colour scale of shares; it reads the same with a colour-vision deficiency."""
 
 
 def preset_choice(presets: Mapping[str, Results]) -> Choice:
-    """Which settings; the first preset to start with."""
+    """The choice of a preset; initially the first."""
     return Choice("preset", "Preset", [(name, name) for name in presets], next(iter(presets)))
 
 
 def setup_choice(name: str, label: str, setups: list[Setup]) -> Choice:
-    """One of some setups, 10r×2g to start with if it is among them."""
+    """The choice of a setup; initially `FAVOURITE` if it is among them."""
     first = FAVOURITE if FAVOURITE in setups else setups[0]
     return Choice(name, label, [(str(setup), str(setup)) for setup in setups], str(first))
 
 
 def method_choice(methods: list[str]) -> Choice:
-    """One of some methods."""
+    """The choice of a method; initially the first."""
     return Choice("method", "Method", [(method, method_label(method)) for method in methods], methods[0])
 
 
 def heatmaps(presets: Mapping[str, Results]) -> Chart:
-    """Fixed success, robots x groups, a map a method."""
+    """Heat maps of Fixed success over robots and groups, one per method."""
     views = {}
     for name, results in presets.items():
         found = {method: _fixed_rates(results, method) for method in results.methods()}
@@ -69,12 +70,12 @@ def heatmaps(presets: Mapping[str, Results]) -> Chart:
     return Chart("success", "Success by robots and groups", note + hint, [preset_choice(presets)], views)
 
 
-def _fixed_rates(results: Results, method: str) -> dict[Setup, Measured]:
+def _fixed_rates(results: Results, method: str) -> dict[Setup, Measurement]:
     rates = {setup: measured(results.fixed(method, setup), success) for setup in SETUPS}
     return {setup: rate for setup, rate in rates.items() if rate is not None}
 
 
-def _heatmap(rates: dict[Setup, Measured]) -> Figure:
+def _heatmap(rates: dict[Setup, Measurement]) -> Figure:
     lines = [[rates.get(Setup(robots, groups)) for groups in GROUPS] for robots in ROBOTS]
     heat = {
         "type": "heatmap",
@@ -97,8 +98,8 @@ def _heatmap(rates: dict[Setup, Measured]) -> Figure:
     return {"data": [heat], "layout": {**shape, "margin": {"l": 34, "r": 4, "t": 4, "b": 28}, "height": 300}}
 
 
-def _cell_text(setup: Setup, rate: Measured | None) -> dict[str, object]:
-    """The rate and its interval on a cell, in black or white, whichever is easier to read there."""
+def _cell_text(setup: Setup, rate: Measurement | None) -> dict[str, object]:
+    """Annotation of a cell: its rate and interval, in black or white, whichever has the higher contrast there."""
     text = {"x": f"{setup.groups}g", "y": f"{setup.robots}r", "showarrow": False}
     if rate is None:
         return {**text, "text": "–", "font": {"color": "--muted"}}
@@ -109,18 +110,18 @@ def _cell_text(setup: Setup, rate: Measured | None) -> dict[str, object]:
 
 
 BLACK_FROM = 0.179
-"""Relative luminance above which black has the higher contrast than white (WCAG 2: (L + 0.05)^2 = 1.05 * 0.05)."""
+"""Relative luminance from which black has a higher contrast than white (WCAG 2: (L + 0.05)^2 = 1.05 * 0.05)."""
 
 
 def _luminance(share: float) -> float:
-    """Relative luminance (WCAG 2) of a share's colour on the scale."""
+    """Relative luminance (WCAG 2) of the scale's colour for a share."""
     ((red, green, blue),) = sample_colorscale(HEAT, [share], colortype="tuple")
     linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (red, green, blue)]
     return float(0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2])
 
 
 def transfers(presets: Mapping[str, Results]) -> Chart:
-    """Policies trained in one setup and tested in others, beside those trained there."""
+    """Policies trained in one setup and tested in others, beside those trained in the test's setup."""
     known = in_order(method for results in presets.values() for method in results.methods())
     methods = [m for m in known if any(results.fixed_present(m) for results in presets.values())]
     setups = [s for s in SETUPS if any(results.fixed(m, s) for m in methods for results in presets.values())]
@@ -133,8 +134,9 @@ def transfers(presets: Mapping[str, Results]) -> Chart:
                     views[f"{name}|{method}|{trained}"] = view
     choices = [preset_choice(presets), method_choice(methods), setup_choice("trained", "Trained in", setups)]
     note = (
-        "Extrapolation: the policy trained in the chosen setup, tested in that on the axis. Fixed: a policy trained "
-        f"where it is tested. {INTERVALS} M_IN and M_OUT have a row a group in their state, so their groups stay."
+        "Extrapolation: the policy trained in the chosen setup, tested in the setup on the axis. Fixed: a policy "
+        f"trained in the setup on the axis. {INTERVALS} The states of M_IN and M_OUT have one row per group, so that "
+        "their number of groups cannot change."
     )
     return Chart("transfer", "Fixed against Extrapolation", note, choices, views)
 
@@ -160,14 +162,14 @@ def _transfer_view(results: Results, method: str, trained: Setup) -> View | None
     return View(panels, Table(header, lines)) if panels else None
 
 
-def _transfer_figure(fixed: Mapping[Setup, Measured | None], foreign: Mapping[Setup, Measured | None]) -> Figure:
+def _transfer_figure(fixed: Mapping[Setup, Measurement | None], foreign: Mapping[Setup, Measurement | None]) -> Figure:
     bars = [_bars("Fixed", fixed, "--fixed", ""), _bars("Extrapolation", foreign, "--transfer", "/")]
     order = {"type": "category", "categoryarray": [str(setup) for setup in fixed], "categoryorder": "array"}
     axis = {**order, "range": [-0.5, len(fixed) - 0.5], "fixedrange": True, "showgrid": False}
     return {"data": bars, "layout": layout(barmode="group", bargap=0.25, xaxis=axis, yaxis=share_axis())}
 
 
-def _bars(name: str, rates: Mapping[Setup, Measured | None], colour: str, pattern: str) -> dict[str, object]:
+def _bars(name: str, rates: Mapping[Setup, Measurement | None], colour: str, pattern: str) -> dict[str, object]:
     found = {setup: rate for setup, rate in rates.items() if rate is not None}
     return {
         "type": "bar",
@@ -182,7 +184,7 @@ def _bars(name: str, rates: Mapping[Setup, Measured | None], colour: str, patter
 
 
 def failure_causes(presets: Mapping[str, Results]) -> Chart:
-    """Why Fixed episodes fail, a bar a setup."""
+    """Causes of failure of Fixed episodes, one bar per setup."""
     views = {}
     for name, results in presets.items():
         found = {
@@ -197,27 +199,27 @@ def failure_causes(presets: Mapping[str, Results]) -> Chart:
             for setup, row in rows.items()
         ]
         if panels:
-            views[name] = View(panels, Table(("method", "setup", *FAILURES), lines))
+            views[name] = View(panels, Table(("method", "setup", *FAILURE_STYLES), lines))
     note = (
         "Share of all episodes that end in each failure, trained and tested in the same setup; the rest succeed. Bars "
-        "are grouped by robots per group. Missing setups have no bar."
+        "are grouped by robots per group. Setups without data have no bar."
     )
     return Chart("failures", "Why episodes fail", note, [preset_choice(presets)], views)
 
 
-def _failure_shares(results: Results, method: str) -> dict[Setup, dict[str, Measured]]:
+def _failure_shares(results: Results, method: str) -> dict[Setup, dict[str, Measurement]]:
     cells = {setup: results.fixed(method, setup) for setup in SETUPS}
     return {
-        setup: {cause: cell.share(NAMED[cause]) for cause in FAILURES}
+        setup: {cause: cell.share(OUTCOMES[cause]) for cause in FAILURE_STYLES}
         for setup, cell in cells.items()
         if cell is not None
     }
 
 
-def _failure_figure(shares: Mapping[Setup, Mapping[str, Measured]], y_axis: dict[str, Any]) -> Figure:
+def _failure_figure(shares: Mapping[Setup, Mapping[str, Measurement]], y_axis: dict[str, Any]) -> Figure:
     bars = []
     places = [[f"{setup.robots} robots" for setup in shares], [f"{setup.groups}g" for setup in shares]]
-    for cause, (colour, pattern, _, _) in FAILURES.items():
+    for cause, style in FAILURE_STYLES.items():
         rates = [row[cause] for row in shares.values()]
         texts = [[str(setup), as_percent(rate.estimate)] for setup, rate in zip(shares, rates, strict=True)]
         bars.append(
@@ -228,7 +230,7 @@ def _failure_figure(shares: Mapping[Setup, Mapping[str, Measured]], y_axis: dict
                 "y": [rate.estimate.value for rate in rates],
                 "customdata": texts,
                 "hovertemplate": "%{customdata[0]}: %{customdata[1]}<extra>" + cause + "</extra>",
-                "marker": patterned(colour, pattern),
+                "marker": patterned(f"--{cause}", style.pattern),
             }
         )
     axis = {"fixedrange": True, "showgrid": False, "dividercolor": "--line", "dividerwidth": 1}

@@ -1,17 +1,16 @@
-"""Charts of trainings: learning curves with their intervals, and how fast they run."""
+"""Charts of trainings: learning curves with their intervals, and speeds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from statistics import median
-from typing import NamedTuple
 
 from actors.evaluation.statistics import Estimate, as_percent
 from dashboards.analysis.aggregate import Setup
+from dashboards.analysis.failure_styles import FAILURE_STYLES
 from dashboards.analysis.methods import in_order, method_label, method_style
-from dashboards.figures.learning_curve import CurvePoint
+from dashboards.analysis.trainings import CurvePoint, Training
 from dashboards.plotly_charts.chart import (
-    FAILURES,
     Chart,
     Figure,
     Panel,
@@ -23,36 +22,12 @@ from dashboards.plotly_charts.chart import (
 from dashboards.plotly_charts.result_charts import setup_choice
 
 TICKS = [figure * 10**power for power in range(8) for figure in (1, 2, 5)]
-"""Where the marks of logarithmic axes stand."""
+"""Ticks of logarithmic axes."""
 BANDS = "The band is the 95 % interval of each evaluation"
 
 
-class Speed(NamedTuple):
-    """How fast a training ran up to `env_steps`, since the row before."""
-
-    env_steps: int
-    env_steps_per_s: float
-    updates_per_s: float
-
-
-class Training(NamedTuple):
-    """One training: what it is called, where it trains, and what it has measured so far.
-
-    `method` is empty and `setup` None in an environment that is not ours; `is_share` says whether the curve's values
-    are rates.
-    """
-
-    name: str
-    method: str
-    setup: Setup | None
-    seed: int
-    curve: list[CurvePoint]
-    speeds: list[Speed]
-    is_share: bool = True
-
-
 def setup_curves(trainings: Sequence[Training]) -> Chart:
-    """Learning curves of many trainings: a view a setup, a line a method and seed."""
+    """Learning curves of many trainings: one view per setup, one line per method and seed."""
     by_setup: dict[Setup, list[Training]] = {}
     for training in trainings:
         if training.setup is not None and training.curve:
@@ -64,12 +39,12 @@ def setup_curves(trainings: Sequence[Training]) -> Chart:
         panels = [Panel(f"Success in {setup}", _curves_figure(found), wide=True)]
         views[str(setup)] = View(panels, _curves_table(found))
     choices = [setup_choice("setup", "Setup", sorted(by_setup))] if by_setup else []
-    note = f"Greedy episodes on fixed seeds during training. {BANDS}; a line a training seed."
+    note = f"Greedy episodes on fixed seeds during training. {BANDS}; one line per training seed."
     return Chart("curves", "Learning curves", note, choices, views)
 
 
 def run_curves(training: Training) -> Chart:
-    """The learning curve of one training, and the shares of its failures."""
+    """The learning curve of one training, and its shares of failures."""
     value = "success rate" if training.is_share else "mean return"
     panels = [Panel(value.capitalize(), _curves_figure([training]))]
     failed = [point for point in training.curve if point.failures is not None]
@@ -121,7 +96,7 @@ def _value_text(point: CurvePoint, is_share: bool) -> str:
 
 def _failures_figure(points: Sequence[CurvePoint]) -> Figure:
     traces = []
-    for cause, (colour, _, dash, symbol) in FAILURES.items():
+    for cause, style in FAILURE_STYLES.items():
         shares = [point.failures[cause] for point in points if point.failures is not None]
         traces.append(
             {
@@ -131,8 +106,8 @@ def _failures_figure(points: Sequence[CurvePoint]) -> Figure:
                 "x": [point.env_steps for point in points],
                 "y": shares,
                 "hovertemplate": "%{y:.1%}",
-                "line": {"color": colour, "width": 1.8, "dash": dash},
-                "marker": {"color": colour, "size": 5, "symbol": symbol},
+                "line": {"color": f"--{cause}", "width": 1.8, "dash": style.dash},
+                "marker": {"color": f"--{cause}", "size": 5, "symbol": style.marker},
             }
         )
     top = max((max(point.failures.values(), default=0.0) for point in points if point.failures), default=0.0)
@@ -150,7 +125,7 @@ def _curves_table(trainings: Sequence[Training]) -> Table:
 
 
 def sweep_speeds(trainings: Sequence[Training]) -> Chart:
-    """Env steps per second of many trainings against the robots in a world."""
+    """Env steps per second of many trainings against the number of robots in a world."""
     found = [training for training in trainings if training.setup is not None and training.speeds]
     views = {}
     if found:
@@ -161,7 +136,7 @@ def sweep_speeds(trainings: Sequence[Training]) -> Chart:
         ]
         views[""] = View(panels, Table(("training", "median env steps/s", "lowest", "highest"), lines))
     note = (
-        "Each point is one training, updates included; several may have shared a machine. From the journals' rows. "
+        "Each point is one training, including its updates; several may have shared a machine. From the journals. "
         "Both axes are logarithmic."
     )
     return Chart("throughput", "Throughput", note, [], views)
@@ -201,7 +176,7 @@ def _speeds_by_robots(trainings: Sequence[Training]) -> Figure:
 
 
 def run_speeds(training: Training) -> Chart:
-    """Env steps and updates per second of one training over its course."""
+    """Env steps and updates per second over the course of one training."""
     views = {}
     if training.speeds:
         names = ("env_steps_per_s", "updates_per_s")
@@ -210,7 +185,7 @@ def run_speeds(training: Training) -> Chart:
         lines = [(f"{s.env_steps:,}", f"{s.env_steps_per_s:,.0f}", f"{s.updates_per_s:,.0f}") for s in training.speeds]
         views[""] = View(panels, Table(("env steps", "env steps/s", "updates/s"), lines))
     return Chart(
-        "speed", "Throughput", "Each point covers the time since the one before, evaluations included.", [], views
+        "speed", "Throughput", "Each point is the mean since the point before, including evaluations.", [], views
     )
 
 

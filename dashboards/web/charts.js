@@ -1,14 +1,7 @@
-// Charts of the report: Plotly figures in the page's colours, each with its numbers as a table.
+// The report's charts: Plotly figures in the colours of the page, each with a table of its numbers.
 "use strict";
 
-function make(tag, attributes = {}, ...children) {
-  const node = document.createElement(tag);
-  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
-  node.append(...children);
-  return node;
-}
-
-// A select with its label; `options` are [value, text] pairs.
+// A select with its label. `options` are pairs of value and text.
 function makeSelect(label, options, value, onChange) {
   const select = make("select", {"aria-label": label});
   for (const [option, text] of options) select.append(make("option", {value: option}, text));
@@ -28,7 +21,7 @@ function makeNumbers(table, label = "Numbers") {
   return make("details", {}, make("summary", {}, label), make("div", {class: "table-box", tabindex: "0"}, makeTable(table)));
 }
 
-// Colours written --name become the page's; everything else stays.
+// A copy of a Plotly figure in which colours written --name are replaced by the values of the page's CSS variables.
 function coloured(value, style) {
   if (typeof value === "string") return value.startsWith("--") ? style.getPropertyValue(value).trim() : value;
   if (Array.isArray(value)) return value.map(item => coloured(item, style));
@@ -47,7 +40,7 @@ const TEMPLATE = {layout: {
 function drawPlot(plot, figure) {
   const style = getComputedStyle(document.documentElement);
   const {data: traces, layout} = coloured({data: figure.data, layout: {...figure.layout, autosize: true, template: TEMPLATE}}, style);
-  plot.style.height = layout.height + "px";  // else a redraw while the page changes its width leaves none
+  plot.style.height = layout.height + "px";  // otherwise a redraw during a change of width may set it to 0
   Plotly.react(plot, traces, layout, {responsive: true, displayModeBar: false});
 }
 
@@ -61,7 +54,7 @@ class Chart {
       this.choiceBox, this.panels, this.numbers);
   }
 
-  // Takes newer data and keeps what the reader chose, as long as it is there.
+  // Takes newer data and keeps the reader's choices if they still exist.
   update(spec) {
     this.spec = spec;
     for (const {name, options, default: first} of spec.choices) {
@@ -109,7 +102,7 @@ class Chart {
     const plot = node.querySelector(".plot");
     node.classList.toggle("wide", panel.wide);
     node.querySelector("figcaption").textContent = panel.title;
-    plot.setAttribute("aria-label", this.spec.title + ": " + panel.title + ". The numbers stand in the table below.");
+    plot.setAttribute("aria-label", this.spec.title + ": " + panel.title + ". The numbers are in the table below.");
     drawPlot(plot, panel.figure);
     if (this.onClick && !plot.clickable) {
       plot.clickable = true;

@@ -1,7 +1,7 @@
-// The scene on the canvas: metres to CSS pixels, y up.
+// Draws the scene on the canvas. x and y are in metres, y upwards; toX and toY give CSS pixels.
 "use strict";
 const STATE_DASHES = [[2, 3], [], [4, 2], [1.5, 2]];
-const CLOSE_UP = 3;  // how much larger the learning robot's surroundings are in a close-up
+const CLOSE_UP = 3;  // magnification of a close-up
 let pxPerM = 1;
 const centre = {x: 0, y: 0};
 
@@ -28,7 +28,7 @@ function fill(colour, on = context) {
   on.fill();
 }
 
-// Makes a canvas as sharp as the screen and clears it; returns its edge in CSS pixels, 0 where it is hidden.
+// Sets a canvas to the screen's resolution and clears it; returns its edge in CSS pixels, 0 if it is hidden.
 function prepare(target, on) {
   const size = target.clientWidth, density = window.devicePixelRatio || 1, pixels = Math.round(size * density);
   if (!size) return 0;
@@ -99,7 +99,7 @@ function drawSensing() {
   if (action >= 0 && action < data.sectors) drawHeading(x, y, inner, headingOf(action));
 }
 
-// The angle that sectors count from: the world's, or that of the learning robot's goal.
+// The angle from which sectors are counted: 0, or the direction of the learning robot's goal.
 function frameTurn() {
   if (!data.sectors_face_goal) return 0;
   const [goalX, goalY] = data.goals[learnerGroup];
@@ -122,7 +122,7 @@ function drawSectors(x, y, radius) {
   context.globalAlpha = 1;
 }
 
-// The action taken now: the middle of the sector that the policy heads for.
+// Draws the action of this step: the heading in the middle of its sector.
 function drawHeading(x, y, inner, turn) {
   const from = robotRadius() + 6, to = Math.max(inner, from + 10);
   context.lineCap = "round";
@@ -134,7 +134,7 @@ function drawHeading(x, y, inner, turn) {
   context.lineCap = "butt";
 }
 
-// A group's ellipse as sim_core/methods/ellipse.py has it: centre, half-axes and the angle of the larger one.
+// A group's ellipse as in sim_core/methods/ellipse.py: centre, half-axes, and the angle of the major axis.
 function ellipseOf(group) {
   const robots = [];
   for (let robot = 0; robot < numRobots; robot++) {

@@ -1,4 +1,4 @@
-// The episodes of the report: one policy in one setup after the other, by outcome and number.
+// The report's episodes: the choice of a policy, setup, outcome and number, and the player.
 "use strict";
 const FIELDS = [["preset", "Preset"], ["policy", "Policy"], ["method", "Method"], ["trained", "Trained in"],
   ["seed", "Training seed"], ["played", "Tested in"]];
@@ -26,7 +26,8 @@ const episodes = {
     this.show();
   },
 
-  // The choices in turn, each among what the ones before leave; the first of them where the wanted is not there.
+  // Applies the choices one by one, each among the groups that the earlier ones leave. A choice that is not among them
+  // is replaced by the first.
   narrow() {
     let left = this.groups;
     const offered = [];
@@ -60,7 +61,7 @@ const episodes = {
     this.play(group, have);
   },
 
-  // How many episodes of an outcome can be played: all where the page is served, else those in the file.
+  // Number of episodes of an outcome that can be played: all on a served page, else those embedded in the file.
   available(group, outcome) {
     if (REFRESH_S > 0) return group.counts[outcome] || 0;
     let count = 0;
@@ -90,7 +91,7 @@ const episodes = {
     if (!have || key === this.shown) return;
     try {
       const episode = this.samples[key] || await this.fetched(group.key, outcome, number);
-      if (ask !== this.asked) return;  // the reader has gone on
+      if (ask !== this.asked) return;  // another episode has been chosen meanwhile
       this.shown = key;
       await load(episode);
     } catch (error) {

@@ -1,5 +1,5 @@
-// ORCA's half-planes of one robot (van den Berg et al. 2011, Section 4), as sim_core/orca.py builds them: from the
-// positions and velocities of the step shown, for the velocity of the next one.
+// ORCA's half-planes of one robot (van den Berg et al. 2011, Section 4), as in sim_core/orca.py: they constrain the
+// velocity of the next step, given positions and velocities of the step that is shown.
 "use strict";
 const space = element("space"), spaceContext = space.getContext("2d");
 
@@ -14,7 +14,7 @@ function neighboursOf(robot, now) {
   return found.sort((a, b) => Math.hypot(a.x, a.y) - Math.hypot(b.x, b.y)).slice(0, data.orca.max_neighbours);
 }
 
-// Permitted velocities lie to the left of the direction (dx, dy) through the point (x, y), m/s.
+// The half-plane of permitted velocities: to the left of the line through (x, y) in the direction (dx, dy), m/s.
 function halfPlane(rel, relV, v) {
   const radius = 2 * data.orca.radius_m, distanceSq = rel.x * rel.x + rel.y * rel.y, apart = distanceSq > radius * radius;
   const inverse = 1 / (apart ? data.orca.horizon_s : data.time_step_s);
@@ -58,7 +58,7 @@ function drawNeighbours() {
   stroke(theme.muted, 1, [3, 3]);
 }
 
-// The corners of what all planes permit, out of a square around 0; empty where they exclude each other.
+// Corners of the velocities that all half-planes permit within a square around 0; none if there are no such velocities.
 function permitted(planes, half) {
   let corners = [[-half, -half], [half, -half], [half, half], [-half, half]];
   for (const plane of planes) {
@@ -105,7 +105,7 @@ function drawSpace() {
     fill(theme.text, spaceContext);
   }
   element("planes-text").textContent = piloted
-    ? "The learning robot obeys its policy, not ORCA."
-    : planes.length + " lines, one a neighbour" + (corners.length ? "." : "; they exclude each other, so the least bad "
-      + "velocity is taken.") + " Dashed: " + speed + " m/s.";
+    ? "The learning robot follows its policy, not ORCA."
+    : planes.length + " lines, one per neighbour" + (corners.length ? "." : "; no velocity satisfies all, so the one that "
+      + "violates them least is taken.") + " Dashed: " + speed + " m/s.";
 }

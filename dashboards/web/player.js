@@ -1,20 +1,20 @@
-// One episode in time: what is loaded, the step shown, and the controls. draw.js and orca.js draw it.
+// The player: the loaded episode, the step that is shown, and the controls. draw.js and orca.js draw it.
 "use strict";
-const element = id => document.getElementById(id);
 const canvas = element("canvas"), context = canvas.getContext("2d");
-const ARROW_S = 0.6;  // an arrow ends where the robot would be after this time
+const ARROW_S = 0.6;  // an arrow of velocity ends where the robot would be after this time
 const show = {sensing: true, ellipses: true, velocity: false, machine: false, planes: false, follow: false};
-let data = null;     // the episode as dashboards/pages/player.py gives it
+let data = null;     // the episode, as from player_data in dashboards/pages/player.py
 let groupOfRobot = [], numRobots = 0, learnerGroup = 0, positions = null, machine = null, actions = null;
-let selected = 0;    // the robot whose ORCA lines are shown
-let step = 0;        // fractional while playing
+let selected = 0;    // robot whose ORCA lines are shown
+let step = 0;        // step that is shown; fractional while playing
 let playing = false;
-let lastTime = 0;    // ms, of the last frame played
+let lastTime = 0;    // time of the last frame played, ms
 let nextFrame = 0;
-let onEnd = () => {};  // called when play reaches the last step
+let onEnd = () => {};  // called when playing reaches the last step
 const theme = {};
 
-// Differences from step to step as two planes of bytes, the low ones first; sums wrap as int16 does.
+// Positions in metres from their packed form: int16 differences from step to step, low bytes before high bytes. Sums
+// wrap around as int16.
 function decodePositions(bytes) {
   const count = bytes.length / 2, stride = 2 * numRobots, units = new Int16Array(count), metres = new Float32Array(count);
   for (let i = 0; i < count; i++) {
@@ -82,7 +82,7 @@ function readTheme() {
   }
 }
 
-// What the player says in words.
+// Updates the texts: step, time, outcome, and the canvas's label.
 function report() {
   const now = Math.floor(step), ended = now === data.steps ? ", " + data.outcome : "";
   const text = "Step " + now + " / " + data.steps + " · " + (now * data.time_step_s).toFixed(2) + " s" + ended;
@@ -140,7 +140,7 @@ function buildLegends() {
   });
 }
 
-// Moving in time.
+// Time.
 function seek(target) {
   step = Math.min(Math.max(target, 0), data.steps);
   draw();
@@ -176,8 +176,8 @@ function pauseAt(target) {
   seek(target);
 }
 
-// Keys count in the whole page of a player, and in the player alone where it is a part of a page. A focused
-// control keeps the keys that it uses itself: space on a button, arrows in a list.
+// Keys work everywhere on a page of the player alone; on a page with other content, inside the player only. A focused
+// control keeps its own keys: space on a button, arrows in a list.
 function onKey(event) {
   if (!data || event.ctrlKey || event.altKey || event.metaKey) return;
   if (event.target.closest("select, input[type=number]")) return;

@@ -1,3 +1,3 @@
-// The page of one episode.
+// A page with one episode, which is embedded.
 "use strict";
 load(JSON.parse(element("data").textContent));

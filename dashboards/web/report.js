@@ -1,10 +1,10 @@
-// The report: its sections from the data, the episodes to choose from, and, where it is served, newer data.
+// The report: makes its sections from the data; a served page also requests newer data.
 "use strict";
 const VERDICT_MARKS = {"holds": ["✓", "holds"], "does not hold": ["✗", "fails"], "undecided": ["?", "undecided"],
   "no data": ["–", "none"]};
-const REFRESH_S = Number(document.body.dataset.refreshS);  // 0: from disk, for good
+const REFRESH_S = Number(document.body.dataset.refreshS);  // 0 if the page was opened from disk
 const charts = new Map();
-let content = null;   // what the page shows
+let content = null;   // the report's data
 
 async function unpackText(id) { return new TextDecoder().decode(await inflate(element(id).textContent)); }
 
@@ -24,12 +24,12 @@ function showContent(newer) {
     make("div", {}, make("dt", {}, name), make("dd", {}, value))));
   for (const spec of content.charts) showChart(spec);
   showClaims();
-  for (const part of content.tables) showTable(part);
+  for (const table of content.tables) showTable(table);
   episodes.update(content.episodes);
   buildContents();
 }
 
-// Sections stand in the order in which the data names them.
+// Inserts a section at its place in the order that the data gives.
 function place(section) {
   if (section.parentNode) return;
   const order = content.order, after = order.slice(order.indexOf(section.id) + 1);
@@ -42,12 +42,12 @@ function showChart(spec) {
   if (known) return known.update(spec);
   const chart = new Chart(spec);
   charts.set(spec.key, chart);
-  place(chart.section);  // first, so that what is drawn knows its width
+  place(chart.section);  // before drawing, so that plots have a width
   if (spec.key === "success") followClicks(chart);
   chart.update(spec);
 }
 
-// A click on a cell of a map shows that cell everywhere.
+// A click on a cell of a heat map selects its setup in the other charts and in the player.
 function followClicks(chart) {
   chart.onClick = (methodName, point) => {
     const method = Object.keys(content.methods).find(name => content.methods[name] === methodName);
@@ -55,17 +55,17 @@ function followClicks(chart) {
     charts.get("transfer")?.choose({preset, method, trained: setup});
     charts.get("curves")?.choose({setup});
     episodes.choose({preset, policy: "learned", method, trained: setup, played: setup});
-    chart.said.textContent = methodName + " " + setup + " is shown in the charts and in the player below.";
+    chart.message.textContent = methodName + " " + setup + " is shown in the charts and in the player below.";
   };
-  chart.said = make("p", {class: "note", role: "status"});
-  chart.numbers.before(chart.said);
+  chart.message = make("p", {class: "note", role: "status"});
+  chart.numbers.before(chart.message);
 }
 
 function showClaims() {
   if (!content.claims.length) return;
   const section = element("claims") || make("section", {id: "claims"});
   const open = new Set([...section.querySelectorAll("details[open]")].map(node => node.dataset.claim));
-  const how = make("details", {"data-claim": "how"}, make("summary", {}, "How they are judged"),
+  const how = make("details", {"data-claim": "how"}, make("summary", {}, "How claims are judged"),
     make("p", {class: "note"}, content.claims_note));
   how.open = open.has("how");
   section.replaceChildren(make("h2", {}, "The dissertation’s claims"), how);
@@ -105,7 +105,7 @@ function buildContents() {
     make("a", {href: "#" + node.id}, node.querySelector("h2").textContent)));
 }
 
-// Where the page is served: newer data every few seconds, as long as somebody looks at it.
+// Requests newer data, unless the page is hidden.
 async function refresh() {
   if (document.hidden) return;
   const status = element("status");
@@ -115,10 +115,10 @@ async function refresh() {
     if (!answer.ok) throw new Error(answer.statusText);
     const newer = await answer.json();
     status.className = "muted live";
-    status.textContent = "Live, looked again at " + new Date().toLocaleTimeString();
+    status.textContent = "Live, updated at " + new Date().toLocaleTimeString();
     if (newer.stamp !== content.stamp) showContent(newer);
   } catch (error) {
     status.className = "muted stopped";
-    status.textContent = "The server does not answer; this is what it said last.";
+    status.textContent = "The server does not answer; this is its last answer.";
   }
 }

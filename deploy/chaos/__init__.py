@@ -1,1 +1,1 @@
-"""Fault injection: a training whose processes are killed, frozen and delayed."""
+"""Fault injection into a small training, and the invariants that must hold afterwards."""

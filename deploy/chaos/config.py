@@ -1,4 +1,4 @@
-"""The run that `shoal chaos` attacks: small, with two of everything that can be lost, and with something to learn."""
+"""The run that `shoal chaos` trains: small, with two of every component that can be lost, and a task to learn."""
 
 from __future__ import annotations
 
@@ -39,5 +39,5 @@ horizon_steps = 400
 
 
 def write_config(path: Path, env_steps: int) -> None:
-    """Writes the run's settings for `shoal train --config`."""
+    """Writes the run's settings as TOML, for `shoal train --config`."""
     path.write_text(_TEXT.format(env_steps=env_steps))

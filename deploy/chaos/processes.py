@@ -1,4 +1,4 @@
-"""The processes of a chaos run: an MLflow server, the command that trains, and whom to hurt among its children."""
+"""The processes of a chaos run: the MLflow server, the training command, and its children as victims of faults."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from urllib.request import urlopen
 import psutil
 
 START_S = 180.0
-"""How long a process may take to start on a busy machine."""
+"""Time limit for a process to start, on a busy machine."""
 TITLES = {
     "rollout worker": "ray::RolloutNode",
     "replay shard": "ray::ShardNode",
     "learner": "ray::LearnerActor",
     "evaluation": "ray::evaluate",
 }
-"""How Ray calls the process of each kind of part."""
+"""Ray's process title of each kind of component."""
 
 
 def free_port() -> int:
-    """A port of the loopback interface that nobody listens on now."""
+    """A port of the loopback interface that is free now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -35,10 +35,10 @@ def free_port() -> int:
 
 
 class TrackingServer:
-    """`mlflow server` on loopback with its database in a folder; may be killed and started again.
+    """`mlflow server` on the loopback interface; it can be killed and started again.
 
     Args:
-      folder: where its database, artifacts and log lie.
+      folder: the folder of its database, artifacts and log.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -48,16 +48,16 @@ class TrackingServer:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Starts it; returns at once."""
+        """Starts the server without waiting for it."""
         command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(self._port)]
         command += ["--workers", "1", "--backend-store-uri", f"sqlite:///{self._folder / 'mlflow.db'}"]
         command += ["--artifacts-destination", str(self._folder / "mlartifacts")]
-        environment = os.environ | {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}  # seven processes that nobody needs
+        environment = os.environ | {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}  # saves seven processes
         with (self._folder / "mlflow.log").open("ab") as log:
             self._process = subprocess.Popen(command, stdout=log, stderr=log, env=environment, start_new_session=True)
 
     def answers(self) -> bool:
-        """Whether it takes requests."""
+        """Whether the server accepts requests."""
         try:
             with urlopen(f"{self.uri}/health", timeout=2) as reply:
                 return bool(reply.status == 200)
@@ -65,10 +65,10 @@ class TrackingServer:
             return False
 
     def wait(self) -> None:
-        """Waits until it answers.
+        """Waits until the server answers.
 
         Raises:
-          TimeoutError: it does not.
+          TimeoutError: it does not within `START_S`.
         """
         end_s = time.monotonic() + START_S
         while not self.answers():
@@ -77,23 +77,23 @@ class TrackingServer:
             time.sleep(0.2)
 
     def start_again(self) -> None:
-        """Starts it if it was killed."""
+        """Starts the server if it was killed."""
         if self._process is None:
             self.start()
 
     def kill(self) -> None:
-        """Kills it with its children, which are all of its own session."""
+        """Kills the server with its children."""
         if self._process is not None:
-            kill_family(self._process.pid)
+            kill_tree(self._process.pid)
             self._process.wait()
             self._process = None
 
 
 class Driver:
-    """`shoal train` or `shoal resume` in the background, its output appended to a log.
+    """`shoal train` or `shoal resume` in the background.
 
     Args:
-      log: the file.
+      log: file to which its output is appended.
     """
 
     def __init__(self, log: Path) -> None:
@@ -101,7 +101,7 @@ class Driver:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self, *arguments: str) -> None:
-        """Starts `shoal` with these arguments."""
+        """Starts `shoal` with the given arguments."""
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "deploy", *arguments],
@@ -111,11 +111,11 @@ class Driver:
             )
 
     def exit_code(self) -> int | None:
-        """Its exit code; None while it runs."""
+        """The exit code; None while the process runs."""
         return None if self._process is None else self._process.poll()
 
     def children(self, kind: str) -> list[psutil.Process]:
-        """Processes of the run's parts of a kind, in the order of their ids."""
+        """The running processes of one kind of component, ordered by process id; suspended ones are left out."""
         found = []
         for process in _children(self._pid):
             try:
@@ -131,34 +131,34 @@ class Driver:
         return 0 if self._process is None else self._process.pid
 
     def kill(self) -> None:
-        """Kills the driver alone, as an out-of-memory killer would; Ray's processes go with it by themselves."""
-        family = _children(self._pid)
+        """Kills the driver alone, as the OOM killer would; Ray's processes then exit by themselves."""
+        tree = _children(self._pid)
         os.kill(self._pid, signal.SIGKILL)
         if self._process is not None:
             self._process.wait()
-        _, alive = psutil.wait_procs(family, timeout=10)
-        _kill(alive)  # those that were stopped
+        _, alive = psutil.wait_procs(tree, timeout=10)
+        _kill(alive)  # suspended processes do not exit by themselves
 
     def end(self) -> None:
-        """Kills all that is left."""
+        """Kills the driver and its descendants, if it still runs."""
         if self.exit_code() is None and self._process is not None:
-            kill_family(self._pid)
+            kill_tree(self._pid)
             self._process.wait()
 
     def tail(self, lines: int) -> str:
-        """The end of its output."""
+        """The last lines of the output."""
         return "\n".join(self._log.read_text(errors="replace").splitlines()[-lines:])
 
 
 def fill_disk(process: psutil.Process) -> Callable[[], None]:
-    """Lets every write of a process to a file fail, as on a full disk; returns what lets it write again."""
+    """Makes a process fail when it writes to files, as on a full disk; returns a function that ends this."""
     limits = process.rlimit(psutil.RLIMIT_FSIZE)
     process.rlimit(psutil.RLIMIT_FSIZE, (0, limits[1]))
 
-    def empty() -> None:
+    def restore() -> None:
         process.rlimit(psutil.RLIMIT_FSIZE, limits)
 
-    return empty
+    return restore
 
 
 def _children(pid: int) -> list[psutil.Process]:
@@ -168,14 +168,14 @@ def _children(pid: int) -> list[psutil.Process]:
         return []
 
 
-def kill_family(pid: int) -> None:
-    """Kills a process and all that descend from it."""
-    family = _children(pid)
+def kill_tree(pid: int) -> None:
+    """Kills a process and its descendants."""
+    tree = _children(pid)
     try:
-        family.append(psutil.Process(pid))
+        tree.append(psutil.Process(pid))
     except psutil.NoSuchProcess:
         return
-    _kill(family)
+    _kill(tree)
 
 
 def _kill(processes: list[psutil.Process]) -> None:

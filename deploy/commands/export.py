@@ -1,4 +1,4 @@
-"""`shoal export`: a trained policy as ONNX and as a torch ExportedProgram, for robots and other programs."""
+"""`shoal export`: writes a trained policy as ONNX and as a torch ExportedProgram, for robots and other programs."""
 
 from __future__ import annotations
 
@@ -30,16 +30,20 @@ from sim_core.checks import require
 FORMAT = "shoal-policy-1"
 
 
-class Source(NamedTuple):
-    """Where a policy comes from: its run, the config, the weights, and the file or folder that was named."""
+class LoadedPolicy(NamedTuple):
+    """A policy with the run that it comes from and that run's config."""
 
     folder: RunFolder
     config: RunConfig
     weights: WeightsSnapshot
 
 
-def find_source(name: str, runs_dir: Path) -> Source:
-    """The policy of a run, of one of its checkpoints, or of a policy file in a run's folder.
+def load_policy(name: str, runs_dir: Path) -> LoadedPolicy:
+    """Loads the policy of a run, of one of its checkpoints, or of a policy file in a run's folder.
+
+    Args:
+      name: the run's name, or a path of the run, the checkpoint or the file.
+      runs_dir: folder of all runs.
 
     Raises:
       ConfigError: there is none, or it does not fit its run's config.
@@ -48,19 +52,19 @@ def find_source(name: str, runs_dir: Path) -> Source:
     if path.is_file():
         folder = find_run(str(path.absolute().parent), runs_dir)
         config = folder.config()
-        return Source(folder, config, read_saved_policy(path, config, env_shape(config.env)))
+        return LoadedPolicy(folder, config, read_saved_policy(path, config, env_shape(config.env)))
     if (path / MANIFEST).is_file():
         folder = find_run(str(path.absolute().parent.parent), runs_dir)
         config = folder.config()
         checkpoint = read_checkpoint(FolderStore(path.absolute().parent), path.absolute().name)
-        return Source(folder, config, read_policy(checkpoint, config, env_shape(config.env)))
+        return LoadedPolicy(folder, config, read_policy(checkpoint, config, env_shape(config.env)))
     folder = find_run(name, runs_dir)
     config = folder.config()
-    return Source(folder, config, find_policy(folder, config))
+    return LoadedPolicy(folder, config, find_policy(folder, config))
 
 
-class _Parts(NamedTuple):
-    """What is exported: the module, its ports, and the states to check it on."""
+class _Exportable(NamedTuple):
+    """The module to export, its inputs and outputs, and the reference states to check the files on."""
 
     module: nn.Module
     inputs: list[Port]
@@ -68,21 +72,21 @@ class _Parts(NamedTuple):
     states: Sensed
 
 
-def _parts(command: Export, config: RunConfig, weights: WeightsSnapshot) -> _Parts:
+def _exportable(command: Export, config: RunConfig, weights: WeightsSnapshot) -> _Exportable:
     shape = env_shape(config.env)
     network = QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions)
     load_snapshot(network, weights)
     if command.bare:
         states = observed_states(config.env, weights, command.first_seed, command.states)
-        return _Parts(BarePolicy(network), bare_inputs(shape), bare_outputs(shape), states)
+        return _Exportable(BarePolicy(network), bare_inputs(shape), bare_outputs(shape), states)
     world = config.world
     states = swarm_states(world, weights, weights, command.first_seed, command.states)
     robot = make_robot(network, world)
-    return _Parts(robot, robot.inputs(world), robot.outputs(world), states)
+    return _Exportable(robot, robot.inputs(world), robot.outputs(world), states)
 
 
 def metadata(config: RunConfig, weights: WeightsSnapshot, bare: bool) -> dict[str, Any]:
-    """What an exported file says of itself, beside its inputs and outputs."""
+    """The metadata of an exported file, in addition to its inputs and outputs."""
     world = config.world
     robot = {} if bare else {"method": world.method_name, "setup": world.setup, "frame": FRAME}
     timing = {} if bare else {"time_step_s": world.time_step_s, "outer_radius_m": world.outer_radius_m}
@@ -91,10 +95,15 @@ def metadata(config: RunConfig, weights: WeightsSnapshot, bare: bool) -> dict[st
     return {"format": FORMAT, "env_id": config.env_id, **robot, **timing, **origin, **settings}
 
 
-def export(command: Export) -> int:
-    """Writes the export; returns the exit code."""
+def run(command: Export) -> int:
+    """Writes the export and prints how far it agrees with the simulator's policy; returns the exit code.
+
+    Raises:
+      ConfigError: a package of the extra `export` is missing, there is no such policy, it cannot be exported in this
+        form, or the folder cannot be written to.
+    """
     check_packages()
-    folder, config, weights = find_source(command.run, command.runs_dir)
+    folder, config, weights = load_policy(command.run, command.runs_dir)
     require(
         command.bare or config.world.sector_frame == "world",
         "a robot's export takes positions in the world's frame, but this policy was trained with sector_frame = goal; "
@@ -105,11 +114,11 @@ def export(command: Export) -> int:
         f"what a robot senses in {config.env_id} is not known; export observation to action values with --bare True",
     )
     if not command.bare:
-        robot_class(config.world)  # refuses a method that has none
+        robot_class(config.world)  # raises if the method has no robot module
     out = command.out or folder.artifacts / ("export-bare" if command.bare else "export")
     make_folder(out.absolute().parent, "--out")
-    parts = _parts(command, config, weights)
-    found = write_export(out, *parts[:3], metadata(config, weights, command.bare), parts.states)
+    module, inputs, outputs, states = _exportable(command, config, weights)
+    found = write_export(out, module, inputs, outputs, metadata(config, weights, command.bare), states)
     console = Console()
     console.print(agreement_table(found))
     console.print(str(out), highlight=False, soft_wrap=True)
@@ -117,11 +126,11 @@ def export(command: Export) -> int:
 
 
 def agreement_table(found: dict[str, Agreement]) -> Table:
-    """How exported files answer beside the simulator and its policy."""
+    """How far the exported files agree with the simulator and its policy, a row per file."""
     states = next(iter(found.values())).states
-    table = Table(title=f"beside the simulator and its policy, in {states:,} states of rollouts")
+    table = Table(title=f"agreement with the simulator and its policy in {states:,} states of rollouts")
     names = list(next(iter(found.values())).errors)
-    for column in ("file", "decided otherwise", *(f"largest error: {name}" for name in names)):
+    for column in ("file", "decided differently", *(f"largest error: {name}" for name in names)):
         table.add_column(column, justify="right")
     for file, answer in found.items():
         table.add_row(file, str(answer.different), *(f"{answer.errors[name]:.1e}" for name in names))

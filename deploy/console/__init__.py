@@ -1,1 +1,1 @@
-"""What the commands print while they work."""
+"""What commands print to the terminal."""

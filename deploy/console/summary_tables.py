@@ -1,4 +1,4 @@
-"""Tables that commands end with."""
+"""Tables and lines that commands print at their end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from learner.training.evaluation_summary import Evaluation, outcome_label
 
 
 def evaluation_table(evaluation: Evaluation, title: str, kind: str = "greedy episodes") -> Table:
-    """Every outcome's rate, the return and the length, with 95 % intervals."""
+    """The rate of every outcome, the mean return and the mean length of episodes, with 95 % intervals."""
     table = Table(title=f"{title}: {evaluation.episodes} {kind}", title_justify="left")
     table.add_column("result")
     table.add_column("value", justify="right")
@@ -35,11 +35,11 @@ def _plain(estimate: Estimate, digits: int) -> tuple[str, str]:
 
 
 def summary_lines(folder: RunFolder, result: RunResult, tracking_uri: str, is_swarm: bool) -> list[str]:
-    """What a finished run left behind, and how to look at it; lines, so that paths can be copied whole."""
+    """What a finished run has written, and commands to look at it. Lines and no table, so that paths can be copied."""
     animation = folder.artifacts / ("episode.html" if is_swarm else "episode.mp4")
     lines = {
         "trained": f"{result.env_steps:,} env steps, {result.updates:,} updates",
-        "checkpoint": str(result.checkpoint or "of its end: could not be written"),
+        "checkpoint": str(result.checkpoint or "the final one could not be written"),
         "curve": str(folder.artifacts / "learning_curve.png"),
         "animation": str(animation) if animation.exists() else "none",
         "MLflow UI": tracking_uri,

@@ -1,4 +1,4 @@
-"""What a person sees while a run trains: a live line in a terminal, plain lines elsewhere."""
+"""Progress of a running training: in a terminal a progress bar with the newest metrics, elsewhere plain lines."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from deploy.console.terminal import PlainOutput, is_interactive
 from learner.tracking.journal import Row
 
 PLAIN_INTERVAL_S = 5.0
-"""Least time between two plain lines."""
+"""Minimum time between two plain lines."""
 
 
 class LatestMetrics:
-    """The newest value of every metric, since rows carry only what they measured."""
+    """The newest value of every metric; a row holds only the metrics measured since the last one."""
 
     def __init__(self) -> None:
         self._values: dict[str, float] = {}
 
     def update(self, row: Row) -> None:
-        """Takes a row's values."""
+        """Takes in a row's values."""
         self._values |= row.metrics
 
     def text(self) -> str:
-        """One line: success or return, in training and evaluated, and the speeds."""
+        """One line: success rate or return in evaluation and in training, env steps/s and updates/s."""
         parts = [self._score("eval"), self._score("train")]
         parts += [
             f"{self._values.get('speed/env_steps_per_s', 0):,.0f} env steps/s",
@@ -43,8 +44,8 @@ class LatestMetrics:
         return "" if value is None else f"{prefix} return {value:.1f}"
 
 
-class PlainDisplay:
-    """Lines for logs: at most one every few seconds.
+class PlainDisplay(PlainOutput):
+    """Plain lines for logs, at most one per `PLAIN_INTERVAL_S`.
 
     Args:
       console: where to print.
@@ -58,17 +59,8 @@ class PlainDisplay:
         self._first: tuple[float, int] | None = None
         self._last_s = -math.inf
 
-    def __enter__(self) -> Self:
-        """Nothing to set up."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Nothing to put back."""
-
     def row(self, row: Row) -> None:
-        """Prints the newest metrics, unless it just did."""
+        """Takes in a row; prints the newest metrics if enough time has passed."""
         self._latest.update(row)
         now_s = time.monotonic()
         self._first = self._first or (now_s, row.env_steps)
@@ -92,7 +84,7 @@ class PlainDisplay:
 
 
 class LiveDisplay:
-    """A progress bar that stays in place, with the newest metrics under it.
+    """A progress bar with the newest metrics, redrawn in place.
 
     Args:
       console: the terminal.
@@ -120,11 +112,11 @@ class LiveDisplay:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stops drawing; the last state stays."""
+        """Stops drawing; the last state stays on the screen."""
         self._progress.stop()
 
     def row(self, row: Row) -> None:
-        """Moves the bar on."""
+        """Takes in a row and advances the bar."""
         self._latest.update(row)
         done = max(row.env_steps, self._progress.tasks[0].completed)
         self._progress.update(self._task, completed=done, metrics=self._latest.text())
@@ -136,6 +128,4 @@ class LiveDisplay:
 
 def make_display(console: Console, total_env_steps: int) -> LiveDisplay | PlainDisplay:
     """The display that suits the console."""
-    if console.is_terminal and not console.is_dumb_terminal:
-        return LiveDisplay(console, total_env_steps)
-    return PlainDisplay(console, total_env_steps)
+    return (LiveDisplay if is_interactive(console) else PlainDisplay)(console, total_env_steps)

@@ -1,9 +1,9 @@
-"""A robot's control loop around a policy that `shoal export` wrote; needs numpy and onnxruntime, nothing of shoal.
+"""A robot's control loop with a policy from `shoal export`; it needs numpy and onnxruntime, and nothing of shoal.
 
     python deploy/examples/robot_loop.py runs/RUN/artifacts/export
 
-Here the groups walk straight to their goals and the robot follows its own. On a real robot, positions come from its
-sensors and its teammates, the velocity goes to its drives, and the loop waits for the next tick.
+In this example, all groups move straight to their goals, and the robot follows its own group. On a real robot,
+positions come from its sensors and teammates, the velocity goes to its motors, and the loop waits for the next tick.
 """
 
 import json
@@ -17,7 +17,7 @@ import onnxruntime
 
 
 def load(folder: Path) -> tuple[Any, dict[str, Any]]:
-    """The policy and what it says of itself; ends the program if it does not answer as where it was trained."""
+    """Loads the policy and its metadata; ends the program if it computes other values than when it was exported."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     policy = onnxruntime.InferenceSession(str(folder / "policy.onnx"), options, providers=["CPUExecutionProvider"])
@@ -29,9 +29,9 @@ def load(folder: Path) -> tuple[Any, dict[str, Any]]:
 
 
 def sense(method: str, robot: Any, groups: Any, goals: Any) -> dict[str, Any]:
-    """What the robot senses, as a batch of one: all positions relative to it, its own group first, without it."""
+    """The robot's input, a batch of one: positions of all other robots relative to it, in metres, its own group first."""
     positions = (groups - robot)[None].astype(np.float32)  # [1, groups, robots, 2]
-    mask = np.ones(positions.shape[:3], bool)  # False where a robot is not seen
+    mask = np.ones(positions.shape[:3], bool)  # False for a robot that is not sensed
     if method != "sensor":
         return {"positions": positions, "mask": mask, "goals": (goals - robot)[None].astype(np.float32)}
     other, other_mask = positions[:, 1:].reshape(1, -1, 2), mask[:, 1:].reshape(1, -1)
@@ -39,7 +39,7 @@ def sense(method: str, robot: Any, groups: Any, goals: Any) -> dict[str, Any]:
 
 
 def main(folder: Path, seconds: float = 12.0, walk_m_s: float = 0.5) -> None:
-    """Runs the loop; prints where the robot is once a second."""
+    """Runs the loop; prints the robot's velocity and its distance from its group once a second."""
     policy, about = load(folder)
     tick_s, count = about["time_step_s"], about["settings"]["world"]["groups"]
     starts = 6.0 * np.stack([turn(np.arange(count) * 2 * np.pi / count) for turn in (np.cos, np.sin)], axis=1)

@@ -1,1 +1,1 @@
-"""Options of the commands, as dataclasses."""
+"""Command-line options, one dataclass per command."""

@@ -1,4 +1,4 @@
-"""The command line's arguments for what looks at a run or a sweep: evaluations, pages, figures, exports."""
+"""Command-line options of the commands that use results of a run or a sweep: evaluations, pages, figures, exports."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from learner.presets import PresetName
 from sim_core.checks import require
 
 Switch = Annotated[UseCounterAction[int], arg(help_behavior_hint="(off by default)")]
-"""A flag without a value: 0 unless it is given."""
+"""A flag without a value; 0 unless it is given."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Draw a sweep's figures and judge the dissertation's claims from its table of results."""
+    """Draw figures and judge the dissertation's claims from a sweep's table of results."""
 
     results: Positional[tuple[Path, ...]]
-    """A results.csv that `shoal sweep` wrote, or one of those in dashboards/results; several stand side by side."""
+    """Tables of results: a results.csv of `shoal sweep`, or of dashboards/results. Several are shown side by side."""
     out: Path = Path("runs/report")
     """Folder for report.md, claims.md and the figures."""
 
@@ -30,32 +30,32 @@ class Report:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Play a run's greedy policy, or a baseline, on fixed seeds and print its rates with 95 % intervals."""
+    """Play a run's greedy policy, or a baseline, on fixed seeds; print its rates with 95 % intervals."""
 
     run: Positional[str]
-    """Name of the run, or its folder; or fl-orca, greedy or random (a run of such a name: ./NAME)."""
+    """Name of the run, or its folder; or fl-orca, greedy or random (a run with such a name: ./NAME)."""
     episodes: int = 1_000
     """Episodes to play."""
     first_seed: int = 2_000_000_000
-    """Seed of the first episode; the others count on."""
+    """Seed of the first episode; the others follow it."""
     method: str | None = None
     """Baselines only: method of the world to play in; sensor by default."""
     preset: PresetName | None = None
-    """Baselines only: settings of the world to play in, those of `shoal sweep`; the defaults otherwise."""
+    """Baselines only: preset of the world to play in, as in `shoal sweep`; the defaults otherwise."""
     robots: int | None = None
-    """Robots per group; by default those of the training (others: Extrapolation), or 10 for a baseline."""
+    """Robots per group; by default those of the training, or 10 for a baseline. Others test Extrapolation."""
     groups: int | None = None
-    """Groups; by default those of the training (others: Extrapolation), or 2 for a baseline."""
+    """Groups; by default those of the training, or 2 for a baseline. Others test Extrapolation."""
     checkpoint: str = "newest"
-    """Whose policy: the newest checkpoint's, the best one's by the evaluations during training, or a name (step-…)."""
+    """The policy's checkpoint: newest, best (by the evaluations during training), or a name (step-…)."""
     out: Path | None = None
-    """New file (.zarr) for the results: seed, outcome, length and return of every episode."""
+    """New .zarr file for the results: seed, outcome, length and return of every episode."""
     record: int = 0
-    """Records the first episodes whole, this many, beside the results in FILE-episodes.zarr; needs --out."""
+    """Number of first episodes whose trajectories are stored in FILE-episodes.zarr beside the results; needs --out."""
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
     address: str | None = None
-    """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
+    """Ray cluster to join; RAY_ADDRESS by default, else a Ray on this machine."""
 
     def __post_init__(self) -> None:
         require(1 <= self.episodes <= 10**7, f"--episodes must be in 1..{10**7}, not {self.episodes}")
@@ -67,7 +67,9 @@ class Evaluate:
             0 <= self.record <= self.episodes,
             f"--record must be in 0..{self.episodes} (--episodes), not {self.record}",
         )
-        require(self.record == 0 or self.out is not None, "--record needs --out: episodes lie beside the results")
+        require(
+            self.record == 0 or self.out is not None, "--record needs --out: episodes are stored beside the results"
+        )
         require(
             self.out is None or (self.out.suffix == ".zarr" and bool(self.out.stem)),
             f"--out must name a file that ends in .zarr, not {str(self.out)!r}",
@@ -76,22 +78,22 @@ class Evaluate:
 
 @dataclass(frozen=True, kw_only=True)
 class Watch:
-    """Render one greedy episode of a run: a web page with a player, a video, or a strip of frames."""
+    """Show one greedy episode of a run as a web page with a player, a video, or a strip of frames."""
 
     run: Positional[str]
     """Name of the run, or its folder."""
     format: Literal["html", "mp4", "png"] = "html"
-    """Page with a player, video, or strip of frames (other environments than ours: video only)."""
+    """Page with a player, video, or strip of frames; for other environments than ours, video only."""
     seed: int = 2_000_000_000
     """Seed of the episode."""
     out: Path | None = None
     """File to write; `episode-SEED` in the run's artifacts by default."""
     live: Switch = 0
-    """Look into a running training: a page on 127.0.0.1 that plays the newest checkpoint's policy, again and again."""
+    """Serve a page on 127.0.0.1 that follows a running training: it plays episodes of the newest checkpoint's policy."""
     port: int = 8400
     """--live: port of the page; 0 takes a free one."""
     checkpoint: str = "newest"
-    """Whose policy: the newest checkpoint's, the best one's by the evaluations during training, or a name (step-…)."""
+    """The policy's checkpoint: newest, best (by the evaluations during training), or a name (step-…)."""
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
 
@@ -109,15 +111,15 @@ class Export:
     """Write a policy as ONNX and as a torch ExportedProgram, checked against the simulator."""
 
     run: Positional[str]
-    """Name of the run, or its folder; or one of its checkpoints, or a policy.safetensors in its folder."""
+    """Name of the run, or its folder; or the path of a checkpoint, or of a policy.safetensors in its folder."""
     bare: bool = False
-    """Observation to action values alone, for any environment; else from what a robot senses to its velocity."""
+    """Export observation to action values, for any environment; otherwise what a robot senses to its velocity."""
     out: Path | None = None
-    """Folder to write, replaced if it is there; `export` or `export-bare` in the run's artifacts by default."""
+    """Folder to write, replaced if it exists; `export` or `export-bare` in the run's artifacts by default."""
     states: int = 10_000
-    """States of rollouts in which both files must answer as the simulator and its policy do."""
+    """States from rollouts in which both files must agree with the simulator and its policy."""
     first_seed: int = 2_000_000_000
-    """Seed of the first episode of these rollouts; the others count on."""
+    """Seed of the first episode of these rollouts; the others follow it."""
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
 
@@ -128,20 +130,20 @@ class Export:
 
 @dataclass(frozen=True, kw_only=True)
 class Dashboard:
-    """Show a sweep or a run as an HTML report with its episodes to play: one file, or a page that follows it live."""
+    """Show a sweep or a run as an HTML report with playable episodes: one file, or a page that follows it live."""
 
     source: Positional[str]
     """A sweep (its name, its folder or a results.csv), or a run (its name or its folder)."""
     out: Path | None = None
     """File to write; dashboard.html beside the results by default."""
     serve: Switch = 0
-    """Serve the report on 127.0.0.1 instead of writing it: it follows a running sweep or run, and plays any episode."""
+    """Serve the report on 127.0.0.1 instead of writing it; it follows a running sweep or run, and plays any episode."""
     port: int = 8400
     """--serve: port of the page; 0 takes a free one."""
     episodes: int = 1
-    """Episodes of each policy and outcome that the file takes with it; 0 for none."""
+    """Episodes of each policy and outcome that the file embeds; 0 for none."""
     episodes_mb: float = 5.0
-    """... as long as all of them together take no more than this many megabytes."""
+    """Size limit of all embedded episodes together, in megabytes."""
     runs_dir: Path = Path("runs")
     """Folder of all runs and sweeps."""
 

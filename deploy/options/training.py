@@ -1,4 +1,4 @@
-"""The command line's arguments for what trains, one dataclass a command; tyro makes flags and help of them."""
+"""Command-line options of the commands that train, one dataclass per command; tyro turns fields into flags and help."""
 
 from __future__ import annotations
 
@@ -7,46 +7,46 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from tyro.conf import Positional, Suppress
+from tyro.conf import Fixed, Positional, Suppress
 
 from learner.config import RunConfig
+from learner.placement import DEADLINE_S, START_DEADLINE_S, Place
 from learner.presets import PresetName
 from learner.sweep.grid import SweepConfig
-from learner.training.cluster import DEADLINE_S, START_DEADLINE_S, Place
 from sim_core.checks import require
 
 
 def ray_address(given: str | None) -> str | None:
-    """The Ray cluster in force, None for a Ray of its own."""
+    """The Ray cluster to join: the given one, else RAY_ADDRESS; None starts a Ray on this machine."""
     return given or os.environ.get("RAY_ADDRESS") or None
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnRay:
-    """On which Ray a run's parts are placed, and when one of them is late."""
+class RayOptions:
+    """Which Ray runs the components, and when one of them is late."""
 
     address: str | None = None
-    """Ray cluster to join; RAY_ADDRESS or a Ray of its own on this machine by default."""
+    """Ray cluster to join; RAY_ADDRESS by default, else a Ray on this machine."""
     deadline_s: float = DEADLINE_S
-    """Seconds of silence after which a part of the run that owes an answer is replaced (Ray only)."""
+    """Seconds of silence after which a component that owes an answer is replaced (Ray only)."""
     start_deadline_s: float = START_DEADLINE_S
-    """The same for a part that is being started or restored."""
+    """The same for a component that is starting or being restored."""
 
     def __post_init__(self) -> None:
         require(self.deadline_s >= 1, f"--deadline-s must be at least 1, not {self.deadline_s}")
         require(self.start_deadline_s >= 1, f"--start-deadline-s must be at least 1, not {self.start_deadline_s}")
 
     def ray_address(self) -> str | None:
-        """The Ray cluster in force, None for a Ray of its own."""
+        """The Ray cluster to join; None starts a Ray on this machine."""
         return ray_address(self.address)
 
     def place(self) -> Place:
-        """Where the run's parts go."""
+        """Where the components run, and their deadlines."""
         return Place(self.ray_address(), self.deadline_s, self.start_deadline_s)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Launch(OnRay):
+class Launch(RayOptions):
     """Where a run is stored, logged and placed."""
 
     runs_dir: Path = Path("runs")
@@ -54,7 +54,7 @@ class Launch(OnRay):
     name: str | None = None
     """Name of the run's folder; setup, seed and time by default."""
     tracking_uri: str | None = None
-    """MLflow tracking URI; MLFLOW_TRACKING_URI or a sqlite file in runs_dir by default."""
+    """MLflow tracking URI; MLFLOW_TRACKING_URI by default, else a sqlite file in runs_dir."""
     experiment: str = "shoal"
     """MLflow experiment."""
 
@@ -64,11 +64,11 @@ class Launch(OnRay):
         return self.tracking_uri or os.environ.get("MLFLOW_TRACKING_URI") or default
 
     def artifact_root(self) -> str | None:
-        """Artifact folder of a new experiment: beside a local database, else the server's choice."""
+        """Artifact folder of a new experiment: beside a local database; None leaves the choice to the server."""
         return str(self.runs_dir.absolute() / "mlartifacts") if self.tracking().startswith("sqlite:") else None
 
     def sweep_experiment(self, name: str) -> str:
-        """MLflow experiment of a sweep: the given one, or one of its own."""
+        """MLflow experiment of the sweep `name`: the given one, or one of its own."""
         return f"sweep {name}" if self.experiment == type(self).experiment else self.experiment
 
 
@@ -77,19 +77,19 @@ class Train:
     """Train one setup from the start."""
 
     config: Path | None = None
-    """TOML file with settings; flags override it. World settings stand under [world]."""
+    """TOML file with settings; flags override it. World settings are under [world]."""
     preset: PresetName | None = None
     """Named settings of --method in place of the defaults, those of `shoal sweep`; flags override them."""
     or_resume: bool = False
-    """Go on with the run of this --name where it is there, which must have the same settings; needs --name."""
+    """Resume the run of this --name if it exists; it must have the same settings. Needs --name."""
     run: RunConfig = field(default_factory=RunConfig)
     """What to learn."""
     launch: Launch = field(default_factory=Launch)
     """Where."""
     checkpoint_url: str | None = None
-    """Folder or fsspec URL (s3://bucket/path) for the run's checkpoints; its own folder by default."""
+    """Folder or fsspec URL (s3://bucket/path) for the run's checkpoints; the run's folder by default."""
     keep_best: int = 1
-    """Checkpoints that did best in the evaluations during training, kept beside the newest (--keep-checkpoints)."""
+    """Checkpoints with the best evaluations during training that are kept beside the newest (--keep-checkpoints)."""
 
     def __post_init__(self) -> None:
         require(self.keep_best >= 0, f"--keep-best must be at least 0, not {self.keep_best}")
@@ -97,29 +97,29 @@ class Train:
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """Train and evaluate a grid of setups; the same command again goes on where it was killed."""
+    """Train and evaluate a grid of setups; after a kill, the same command runs what is missing."""
 
     grid: SweepConfig = field(default_factory=SweepConfig)
     """Which setups."""
     launch: Launch = field(default_factory=Launch)
     """Where; the name is that of the sweep, its preset's by default."""
     at_once: int | None = None
-    """Cells trained at once; one a CPU of the cluster by default."""
+    """Cells trained at once; one per CPU of the cluster by default."""
     known: Path | None = None
-    """Results of an earlier sitting (a results.csv): cells that it holds in full are not run again."""
+    """Results of an earlier sweep (a results.csv); cells that it holds in full are not run again."""
 
     def __post_init__(self) -> None:
         require(self.at_once is None or self.at_once >= 1, f"--at-once must be at least 1, not {self.at_once}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Resume(OnRay):
-    """Go on with a run from its newest usable checkpoint."""
+class Resume(RayOptions):
+    """Resume a run from its newest usable checkpoint."""
 
     run: Positional[str]
     """Name of the run, or its folder."""
     total_env_steps: int | None = None
-    """Train on to this many env steps in all; the run's own number by default."""
+    """Train until this many env steps in total; the run's own number by default."""
     device: Literal["auto", "cpu", "cuda"] | None = None
     """Where the learner's networks live; as before by default."""
     runs_dir: Path = Path("runs")
@@ -128,7 +128,7 @@ class Resume(OnRay):
 
 @dataclass(frozen=True, kw_only=True)
 class Chaos:
-    """Train a small run while processes die, freeze or find their disk full; print how long each took to recover."""
+    """Train a small run while processes are killed, frozen or find their disk full; print the recovery times."""
 
     out: Path = Path("runs/chaos")
     """New folder for the run, its MLflow server's database and the logs."""
@@ -137,13 +137,13 @@ class Chaos:
     env_steps: int = 150_000
     """Env steps that the run must reach."""
     faults: int = 1_000
-    """Faults to make at most."""
+    """Faults to inject at most."""
     every_s: float = 4.0
     """Mean time between two faults."""
     deadline_s: float = 10.0
-    """Seconds of silence after which a part is replaced."""
+    """Seconds of silence after which a component is replaced."""
     limit_s: float = 3_600.0
-    """The run counts as hanging after so many seconds."""
+    """The run counts as hung after this many seconds."""
 
     def __post_init__(self) -> None:
         require(self.env_steps > 1_024, f"--env-steps must be above 1024, not {self.env_steps}")
@@ -155,22 +155,24 @@ class Chaos:
 
 @dataclass(frozen=True, kw_only=True)
 class Submit:
-    """Run `shoal train ...` or `shoal sweep ...` as a job of a Ray cluster, and follow its log.
+    """Run `shoal train ...` or `shoal sweep ...` as a job on a Ray cluster, and follow its log.
 
-    The command and its arguments come last, as they would stand after `shoal`. Ctrl-C stops the job, which saves a
-    checkpoint; the same `shoal submit` again goes on with it, or follows it where it still runs.
+    The command and its arguments come last, exactly as after `shoal`. Ctrl-C stops the job, which then saves a
+    checkpoint. The same `shoal submit` again resumes it, or follows it if it is still running.
     """
 
     address: str | None = None
-    """The cluster's dashboard; RAY_API_SERVER_ADDRESS, or http://127.0.0.1:8265 by default."""
+    """The cluster's dashboard; RAY_API_SERVER_ADDRESS by default, else http://127.0.0.1:8265."""
     working_dir: Path = Path(".")
-    """A checkout of shoal, which the job runs; what its .gitignore names is not uploaded."""
+    """A checkout of shoal, which the job runs; files that its .gitignore names are not uploaded."""
     stop_wait_s: int = 120
-    """Time that a stopped job has to save a checkpoint before it is killed."""
+    """Seconds that a stopped job has to save a checkpoint before it is killed."""
     follow: bool = True
-    """Follow the job's log until it has ended; else return once it is submitted."""
-    command: Suppress[tuple[str, ...]] = ()
-    """The job's command, `train` or `sweep`, with its arguments."""
+    """Follow the job's log until it has ended; otherwise return once it is submitted."""
+    arguments: Suppress[Fixed[tuple[str, ...]]] = ()
+    """The job's command line after `shoal`."""
+    job: Suppress[Fixed[Train | Sweep | None]] = None
+    """The same, parsed."""
 
     def __post_init__(self) -> None:
         require(self.stop_wait_s >= 1, f"--stop-wait-s must be at least 1, not {self.stop_wait_s}")

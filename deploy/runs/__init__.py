@@ -1,1 +1,1 @@
-"""Finding runs and policies, and the files they leave."""
+"""Folders of runs and sweeps: names, artifacts, policies, results and their provenance."""

@@ -1,4 +1,4 @@
-"""What a finished run leaves in its folder and in MLflow: config, curve, animation and policy."""
+"""Artifacts of a finished run, in its folder and in MLflow: config, learning curve, animation and policy."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ from actors.evaluation.evaluator import record_episode, record_frames
 from actors.evaluation.trajectory import Episode, load_episodes, save_episodes
 from actors.policy.network import WeightsSnapshot
 from actors.rollout.vector_env import env_shape
-from dashboards.figures.learning_curve import CurvePoint, learning_curve_png
+from dashboards.figures.learning_curve import learning_curve_png
 from dashboards.figures.video import check_video_packages, episode_frames, write_mp4
 from dashboards.pages.player import player_html
 from deploy.runs.folders import write_text
+from deploy.runs.learning_curve import curve_points
 from learner.config import RunConfig
 from learner.file_names import CONFIG
 from learner.run import RunResult
 from learner.run_folder import RunFolder
 from learner.tracking.journal import Row
 from learner.tracking.mlflow_run import Tracker
-from learner.training.evaluation_summary import as_metrics, outcome_label, score
+from learner.training.evaluation_summary import as_metrics, score
 from sim_core.checks import ConfigError
-from sim_core.outcomes import ENDED, Outcome
+from sim_core.outcomes import Outcome
 
 EPISODES_TRIED = 10
-"""Episodes among which the animated one is looked for: the first success."""
+"""The animation shows the first success among this many episodes."""
 VIDEO_SIZE_PX = 480
 
 
@@ -36,47 +37,29 @@ def log_artifacts(
     rows: list[Row],
     say: Callable[[str], None],
 ) -> None:
-    """Makes all artifacts of a finished run and uploads them; says so where there is no animation."""
+    """Writes all artifacts of a finished run and uploads them to MLflow; says so where there is no animation."""
     assert result.weights is not None and result.evaluation is not None
     folder.artifacts.mkdir(exist_ok=True)
-    made = [folder.path / CONFIG, _curve(folder, config, [*rows, _last_row(result)])]
+    written = [folder.path / CONFIG, _curve(folder, config, [*rows, _last_row(result)])]
     if config.env.is_swarm:
-        made += _swarm_animation(folder, config, result.weights)
+        written += _swarm_animation(folder, config, result.weights)
     else:
         path = folder.artifacts / "episode.mp4"
         try:
             check_video_packages()
-            made += foreign_animation(config, result.weights, config.final_eval_first_seed, path)
+            written += foreign_animation(config, result.weights, config.final_eval_first_seed, path)
         except ConfigError as error:
             say(f"no animation: {error}")
-    for path in made:
+    for path in written:
         tracker.artifact(path)
     tracker.log_policy(result.weights, config, env_shape(config.env), score(result.evaluation))
 
 
 def _last_row(result: RunResult) -> Row:
-    """The evaluation at the end, as the curve's last point."""
+    """The final evaluation as a row, for the curve's last point."""
     assert result.evaluation is not None
     metrics = {f"eval/{name}": value for name, value in as_metrics(result.evaluation).items()}
     return Row(result.env_steps, 0, metrics)
-
-
-def curve_points(rows: list[Row]) -> list[CurvePoint]:
-    """The evaluations among a run's rows, in order of env steps."""
-    points = []
-    for row in sorted(rows, key=lambda row: row.env_steps):
-        metrics = row.metrics
-        name = "success_rate" if "eval/success_rate" in metrics else "return"
-        if f"eval/{name}_low" not in metrics:
-            continue
-        failures = (
-            {kind.name.lower(): metrics[f"eval/{outcome_label(kind)}"] for kind in ENDED if kind is not Outcome.GOAL}
-            if name == "success_rate"
-            else None
-        )
-        value, low, high = (metrics[f"eval/{name}{suffix}"] for suffix in ("", "_low", "_high"))
-        points.append(CurvePoint(row.env_steps, value, low, high, failures))
-    return points
 
 
 def _curve(folder: RunFolder, config: RunConfig, rows: list[Row]) -> Path:
@@ -105,19 +88,19 @@ def _first_success(config: RunConfig, weights: WeightsSnapshot) -> Episode:
 
 
 def write_player(store: Path, page: Path, title: str) -> None:
-    """Writes the player of the first episode recorded in `store` to `page`."""
+    """Writes the player of the first episode in the zarr store `store` as HTML to `page`."""
     episodes, world = load_episodes(store)
     write_text(page, player_html(episodes[0], world, title))
 
 
 def write_video(store: Path, path: Path) -> None:
-    """Writes the first episode recorded in `store` as mp4 to `path`, at the speed of the world."""
+    """Writes the first episode in the zarr store `store` as MP4 to `path`, at the speed of simulated time."""
     episodes, world = load_episodes(store)
     write_mp4(episode_frames(episodes[0], world, VIDEO_SIZE_PX), path, 1 / world.time_step_s)
 
 
 def foreign_animation(config: RunConfig, weights: WeightsSnapshot, seed: int, path: Path) -> list[Path]:
-    """Writes one episode of a Gymnasium environment as mp4; nothing if it cannot be rendered."""
+    """Writes one episode of a Gymnasium environment as MP4; returns the file, or none if it cannot be rendered."""
     frames, frames_per_s = record_frames(config.env, weights, seed)
     if not frames:
         return []

@@ -1,21 +1,34 @@
-"""Folders and files that the command line writes to."""
+"""Names, folders and files that the command line writes."""
 
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 from actors.storage.uri import Location, check_writable, join_location, parse_location
 from learner.checkpoints.store import open_store
+from learner.config import RunConfig
 from learner.run_folder import Storage
+from learner.sweep.grid import SweepConfig
 from sim_core.checks import ConfigError, require
 
 JOB = "RAY_JOB_CONFIG_JSON_ENV_VAR"
-"""Ray sets it for the command of a submitted job."""
+"""An environment variable that Ray sets for the command of a submitted job."""
 
 
-def check_lasting(runs_dir: Path) -> None:
-    """Raises ConfigError where `--runs-dir` lies in the copy of its folder that a Ray job runs in."""
+def default_name(config: RunConfig) -> str:
+    """How names of runs with `config` begin, unless the user gives one."""
+    return config.name.replace("×", "").replace(" ", "-").replace("/", "-")
+
+
+def default_sweep_name(grid: SweepConfig) -> str:
+    """Name of a sweep's folder, unless the user gives one: its preset and the settings that differ from it."""
+    return re.sub(r"[^\w.+=-]+", "-", grid.label)
+
+
+def check_outlasts_job(runs_dir: Path) -> None:
+    """Raises ConfigError if `--runs-dir` would be lost with the temporary folder that a Ray job runs in."""
     require(
         runs_dir.is_absolute() or JOB not in os.environ,
         f"a Ray job runs in a copy of its folder, where --runs-dir {runs_dir} would be lost; name an absolute path",
@@ -36,12 +49,12 @@ def make_folder(path: Path, flag: str) -> None:
 
 
 def run_location(checkpoint_url: str, name: str) -> Location:
-    """Where the checkpoints of the run `name` lie under `--checkpoint-url` (see `parse_location` for errors)."""
+    """Where the checkpoints of the run `name` are stored under `--checkpoint-url` (see `parse_location` for errors)."""
     return join_location(parse_location(checkpoint_url), name)
 
 
 def new_storage(checkpoint_url: str | None, name: str, keep_best: int) -> Storage:
-    """How a new run `name` stores its checkpoints: under `--checkpoint-url`, in a folder of its own there.
+    """The checkpoint storage of a new run `name`: a folder of its own under `--checkpoint-url`, or the run's folder.
 
     Raises:
       ConfigError: nothing can be written there, or a run of that name has checkpoints there.
@@ -64,13 +77,13 @@ def new_storage(checkpoint_url: str | None, name: str, keep_best: int) -> Storag
 
 
 def check_plain_name(name: str) -> None:
-    """Raises ConfigError unless `--name` names a folder within another, and none elsewhere."""
+    """Raises ConfigError unless `--name` is a single folder name, which cannot lead to another folder."""
     plain = name == Path(name).name and name not in ("", ".", "..")
     require(plain, f"--name must be a plain folder name, not {name!r}")
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a file; an older one is replaced once the new is whole."""
+    """Writes a UTF-8 file atomically and durably: an older file stays until the new one is complete on disk."""
     part = path.with_name(path.name + ".part")
     with part.open("w", encoding="utf-8", newline="\n") as file:
         file.write(text)

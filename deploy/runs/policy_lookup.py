@@ -1,4 +1,4 @@
-"""The newest policy of a run's folder, once or for as long as the run goes on."""
+"""Finds a policy in a run's folder, once or for as long as the run trains."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from learner.tracking.journal import read_rows
 from sim_core.checks import ConfigError
 
 NEWEST, BEST = "newest", "best"
-"""Which checkpoint is meant, beside the names of single ones."""
+"""Selections of a checkpoint; any other value is a checkpoint's name."""
 
 
 def find_policy(folder: RunFolder, config: RunConfig, which: str = NEWEST) -> WeightsSnapshot:
-    """The policy of a sweep's finished cell, or that of a usable checkpoint.
+    """The policy of a sweep's finished cell, or of a usable checkpoint.
 
     Args:
       folder: the run.
-      config: its config, or one of another setup that the policy fits.
-      which: the newest checkpoint, the one that did best in the evaluations during training, or one by its name.
+      config: its config, or that of another setup that the policy fits.
+      which: `newest`, `best` by the evaluations during training, or a checkpoint's name.
 
     Raises:
-      CheckpointError: there is none, or it does not fit.
+      CheckpointError: there is no such policy, or it does not fit.
     """
     shape = env_shape(config.env)
     is_swept = folder.results.is_file() or not (folder.checkpoints.exists() or folder.storage().checkpoint_url)
     is_named = which not in (NEWEST, BEST)
-    if folder.policy.is_file() and is_swept and not is_named:  # of a cell that is done, only the policy is kept
+    if folder.policy.is_file() and is_swept and not is_named:  # a finished cell keeps its policy alone
         return read_saved_policy(folder.policy, config, shape)
     return read_policy(_checkpoint(folder, which), config, shape)
 
@@ -49,7 +49,7 @@ def _checkpoint(folder: RunFolder, which: str) -> Checkpoint:
 
 
 class NewestPolicy:
-    """The newest policy of a run, read again when there is a newer one.
+    """The newest policy of a run; it is read again when there is a newer one.
 
     Args:
       folder: the run.
@@ -69,17 +69,17 @@ class NewestPolicy:
           ConfigError: the run has none yet.
         """
         try:
-            signature = policy_signature(self._folder)
-            if signature != self._seen:
-                self._weights, self._seen = find_policy(self._folder, self._config), signature
+            fingerprint = policy_fingerprint(self._folder)
+            if fingerprint != self._seen:
+                self._weights, self._seen = find_policy(self._folder, self._config), fingerprint
         except ConfigError:
             if self._weights is None:
-                raise  # else a checkpoint was being removed, or the storage is away: the next call looks again
+                raise  # otherwise a checkpoint was just removed or the storage is down; the next call tries again
         assert self._weights is not None
         return self._weights
 
 
-def policy_signature(folder: RunFolder) -> tuple[str, ...]:
-    """Changes when a run has another newest policy."""
+def policy_fingerprint(folder: RunFolder) -> tuple[str, ...]:
+    """A value that changes when the run has a newer policy."""
     names = finished_names(folder.checkpoint_location())[:1]
     return (*names, str(folder.policy.stat().st_mtime_ns)) if folder.policy.is_file() else tuple(names)

@@ -1,4 +1,4 @@
-"""The sittings of a sweep: with which commands, and with which commit of this code, its results came about."""
+"""Provenance of a sweep's results: the commands, and the commits of this code, that trained them."""
 
 from __future__ import annotations
 
@@ -11,16 +11,19 @@ from typing import Any, NamedTuple
 from learner.file_names import SETTINGS
 from learner.sweep.grid import SweepConfig
 
+KEY = "sittings"
+"""Key of the provenance in `settings.json`."""
 
-class Sitting(NamedTuple):
-    """One start of a sweep that had cells to run: its command without where and how many at once, and the commit."""
+
+class Provenance(NamedTuple):
+    """One `shoal sweep` that had cells to run: its command with the grid's options alone, and the code's commit."""
 
     command: str
     commit: str
 
 
 def sweep_command(grid: SweepConfig) -> str:
-    """The command line whose grid this is, with what differs from the defaults."""
+    """The `shoal sweep` command of a grid, with the options that differ from the defaults."""
     words = ["shoal", "sweep"]
     for name, default in dataclasses.asdict(SweepConfig()).items():
         value = getattr(grid, name)
@@ -30,25 +33,25 @@ def sweep_command(grid: SweepConfig) -> str:
     return shlex.join(words)
 
 
-def read_sittings(table: Path) -> list[Sitting]:
-    """Those that `settings.json` beside a table of results names; none without such a file.
+def read_provenance(table: Path) -> list[Provenance]:
+    """The provenance in `settings.json` beside a table of results, oldest first; empty if there is none to read.
 
-    Before there were sittings, the file told of the last one alone, as `sweep` and `commit`.
+    A file of the first format holds the last command alone, as the grid under `sweep` and its `commit`.
     """
     try:
         stored = json.loads((table.parent / SETTINGS).read_text())
-        if "sittings" not in stored:
-            return [Sitting(sweep_command(grid_of(stored["sweep"])), str(stored["commit"]))]
-        return [Sitting(str(each["command"]), str(each["commit"])) for each in stored["sittings"]]
+        if KEY not in stored:
+            return [Provenance(sweep_command(grid_of(stored["sweep"])), str(stored["commit"]))]
+        return [Provenance(str(each["command"]), str(each["commit"])) for each in stored[KEY]]
     except (OSError, ValueError, KeyError, TypeError):
         return []
 
 
 def grid_of(values: dict[str, Any]) -> SweepConfig:
-    """The grid that `settings.json` stores as `sweep`.
+    """The grid that `settings.json` stores under `sweep`.
 
     Raises:
-      TypeError: a later version has no such setting.
+      TypeError: the file is of another version and holds an unknown setting.
       ConfigError: a value is out of range.
     """
     plain: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}

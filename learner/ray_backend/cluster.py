@@ -37,8 +37,9 @@ from actors.service.fault_policy import CallFailed, ComponentFailed, Fault, firs
 from actors.service.messages import EpisodeStats
 from actors.service.rpc import LocalCalls, Node, Ref
 from learner.config import RunConfig
+from learner.placement import DEADLINE_S, Place
 from learner.ray_backend.auth import HOW, guard_ray
-from learner.training.cluster import DEADLINE_S, Cluster, Place, learner_settings, rollout_settings, shard_settings
+from learner.training.cluster import Cluster, learner_settings, rollout_settings, shard_settings
 from learner.update.learner_node import LearnerNode
 from sim_core.checks import ConfigError, require
 

@@ -25,13 +25,13 @@ from learner.checkpoints.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.export.policy_file import read_saved_policy, save_policy
 from learner.file_names import EVALUATIONS
+from learner.placement import Place
 from learner.run import RunResult, execute, last_checkpoint
 from learner.run_folder import RunFolder, RunIdentity
 from learner.sweep.grid import Cell, SweepConfig, cell_hash, done_cells, other_worlds
 from learner.tracking.journal import Row
 from learner.tracking.mlflow_run import Tracker
 from learner.tracking.redaction import public_uri
-from learner.training.cluster import Place
 from learner.training.evaluation_summary import as_metrics, score, summarise
 from sim_core.config import WorldConfig
 from sim_core.outcomes import ENDED

@@ -19,20 +19,8 @@ from learner.config import RunConfig
 from learner.update.learner_node import LearnerNode
 from learner.update.updates import LearnerSettings
 
-DEADLINE_S = 300.0
-"""A part that owes an answer and is silent for so long is late, unless another deadline is given."""
-START_DEADLINE_S = 300.0
-"""A part that is being started or restored may take so long to answer: it loads libraries, or waits for a free CPU."""
 LAST_WRITE_S = 60.0
 """How long parts of this process may go on writing after an error; a disk that hangs must not hide it."""
-
-
-class Place(NamedTuple):
-    """Where Ray puts a run's parts, the cluster's address or None for this machine, and when one of them is late."""
-
-    address: str | None = None
-    deadline_s: float = DEADLINE_S
-    start_deadline_s: float = START_DEADLINE_S
 
 
 class Cluster(NamedTuple):

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 from learner.config import RunConfig
 from learner.loop import Observer, TrainingLoop
+from learner.placement import Place
 from learner.ray_backend.cluster import ray_cluster
 from learner.tracking.journal import Journal
-from learner.training.cluster import Place
 from tests.benchmarks.processes import cpu_seconds
 from tests.checkpointing import Silent
 

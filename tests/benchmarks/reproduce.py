@@ -17,7 +17,7 @@ from rich.table import Table
 import dashboards
 from actors.evaluation.result_table import LEARNED, ResultRow, read_table
 from actors.evaluation.statistics import Estimate, as_percent, rate
-from dashboards.analysis.aggregate import Cell, Results, Setup
+from dashboards.analysis.aggregate import PooledCell, Results, Setup
 from deploy.cli import main as shoal
 from learner.presets import PresetName
 from sim_core.outcomes import ENDED, Outcome
@@ -49,7 +49,7 @@ def trained_anew(row: ResultRow, folder: Path) -> ResultRow:
     return found
 
 
-def expected(cell: Cell, spread: float) -> Estimate:
+def expected(cell: PooledCell, spread: float) -> Estimate:
     """The 95 % prediction interval of one more training's success rate, from those that are committed.
 
     Args:
@@ -71,7 +71,9 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as folder:
             anew = trained_anew(row, Path(folder))
         setup = Setup(row.robots, row.groups)
-        known = expected(results.fixed(row.method, setup), several.fixed(row.method, setup).spread[Outcome.GOAL])
+        known = expected(
+            results.fixed(row.method, setup), several.fixed(row.method, setup).overdispersion[Outcome.GOAL]
+        )
         same = all(anew.count(outcome) == row.count(outcome) for outcome in ENDED)
         lands = same or known.low <= anew.goal / anew.episodes <= known.high
         good &= lands

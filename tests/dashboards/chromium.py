@@ -18,7 +18,7 @@ FLAGS = (
 
 @contextmanager
 def open_chromium(profile: Path) -> Iterator[Any]:
-    """The browser; the test is skipped by name where there is none."""
+    """The browser; the test is skipped, with the reason, if there is none."""
     binary = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     driver = shutil.which("chromedriver")
     if binary is None or driver is None:
@@ -30,7 +30,7 @@ def open_chromium(profile: Path) -> Iterator[Any]:
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     chromium = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
-    chromium.set_script_timeout(120)  # of a machine that has other work, too
+    chromium.set_script_timeout(120)  # for busy machines
     try:
         yield chromium
     finally:
@@ -38,25 +38,25 @@ def open_chromium(profile: Path) -> Iterator[Any]:
 
 
 def complaints(browser: Any) -> list[dict[str, Any]]:
-    """Errors in the console since the last call; what the page's policy refuses is one."""
+    """Errors in the console since the last call, including refusals of the content security policy."""
     return [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
 
 
 def wait_until(browser: Any, condition: str) -> None:
-    """Waits until a JavaScript expression is true; the script's time limit ends a wait in vain."""
+    """Waits until a JavaScript expression is true; it fails after the script's time limit."""
     check = f"let ok = false; try {{ ok = ({condition}); }} catch (e) {{}} ok ? f() : setTimeout(w, 20)"
     browser.execute_async_script(f"const f = arguments[0]; (function w() {{ {check} }})()")
 
 
 def two_frames(browser: Any) -> None:
-    """Waits until what was asked for is drawn."""
+    """Waits for two animation frames, in which changes are drawn."""
     browser.execute_async_script(
         "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => done()))"
     )
 
 
 def press(browser: Any, key: str) -> None:
-    """A key for whatever has the focus."""
+    """Sends a key to the focused element."""
     from selenium.webdriver.common.action_chains import ActionChains
 
     ActionChains(browser).send_keys(key).perform()
@@ -64,7 +64,7 @@ def press(browser: Any, key: str) -> None:
 
 @contextmanager
 def emulate_scheme(browser: Any, scheme: str) -> Iterator[None]:
-    """The page in `light` or `dark`."""
+    """Shows the page in the `light` or `dark` scheme."""
     media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
     yield
@@ -73,7 +73,7 @@ def emulate_scheme(browser: Any, scheme: str) -> Iterator[None]:
 
 @contextmanager
 def emulate_width(browser: Any, width_px: int) -> Iterator[None]:
-    """The page on a telephone's screen."""
+    """Shows the page on a phone's screen of this width."""
     size = {"width": width_px, "height": 700, "deviceScaleFactor": 2, "mobile": True}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     yield

@@ -1,4 +1,4 @@
-"""Recorded episodes to draw: FL-ORCA drives every robot, or the learning robot holds one heading."""
+"""Recorded episodes to draw: FL-ORCA drives every robot, or the learning robot keeps one heading."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Recorder = Callable[..., Episode]
 
 
 def record_episode(config: WorldConfig, seed: int, action: int | None = None) -> Episode:
-    """One whole episode; `action` is the heading that the learning robot holds, None leaves it to FL-ORCA."""
+    """One episode; `action` is the heading that the learning robot keeps, None lets FL-ORCA drive it."""
     worlds = WorldBatch(config, 1)
     worlds.seed([seed])
     worlds.reset()

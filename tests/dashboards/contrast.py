@@ -1,4 +1,4 @@
-"""Contrast of what a page shows, as WCAG 2 measures it."""
+"""Contrast of a page's texts by WCAG 2."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ for (const node of document.querySelectorAll('body *')) {
 }
 return found;
 """
-"""Colour, background and words of every visible text; numbers on a map have a background of their own."""
+"""Colour, background and words of every visible text, except numbers on heat maps."""
 
 
 def luminance(colour: str) -> float:

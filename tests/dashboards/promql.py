@@ -1,4 +1,4 @@
-"""Queries of the Grafana dashboard and the alerts: their expressions, and the metrics that these name."""
+"""Queries of the Grafana dashboard and the alerts, and the metrics that they name."""
 
 import json
 import re

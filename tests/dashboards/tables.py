@@ -1,4 +1,4 @@
-"""A made-up table of results that agrees with all fifteen claims; tests change single cells of it."""
+"""A synthetic table of results that agrees with all fifteen claims; tests change single cells of it."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def row(
     preset: str = "thesis",
     episodes: int = EPISODES,
 ) -> ResultRow:
-    """A row from percentages; what they leave over are timeouts."""
+    """A row from percentages; the rest are timeouts."""
     counts = [round(share * episodes / 100) for share in (success, lost, captured, collision)]
     home = trained or played
     timeout = episodes - sum(counts)
@@ -71,7 +71,7 @@ def row(
 
 
 def fixed(method: str, played: Setup, **changes: float) -> ResultRow:
-    """The Fixed row of the made-up table, with some of its percentages changed."""
+    """A Fixed row of the synthetic table, with some percentages changed."""
     place = GROUPS.index(played.groups)
     if method == "in":
         shares = {"success": IN_SUCCESS, "lost": 10.0, "captured": 4.0, "collision": 50.0}
@@ -88,12 +88,12 @@ def fixed(method: str, played: Setup, **changes: float) -> ResultRow:
 
 
 def claimed_table(*changed: ResultRow, without: Iterable[ResultRow] = ()) -> list[ResultRow]:
-    """The table with rows replaced by those of the same policy and setup in `changed`, and some left out."""
+    """The table without some rows, and with rows replaced by those of the same policy and setup in `changed`."""
     rows = [fixed(method, setup) for method in ("sensor", "in", "out") for setup in SETUPS]
     rows += [row("sensor", played, success=share, trained=trained) for (trained, played), share in TRANSFERS.items()]
     rows += [
         row("sensor", Setup(robots, 1), success=80.0, trained=Setup(5, 1)) for robots in ROBOTS if robots > 10
-    ]  # drawn, in no claim
+    ]  # drawn in figures, but in no claim
     table = {_key(line): line for line in rows}
     for line in changed:
         table[_key(line)] = line

@@ -1,4 +1,4 @@
-"""The Grafana dashboard and the alerts: every query names a metric that exists, and Grafana's own schema fits."""
+"""The Grafana dashboard and the alerts: every query names an existing metric, and Grafana's schema accepts the rest."""
 
 import copy
 import json
@@ -58,14 +58,14 @@ def test_a_misspelt_metric_is_found(name, wrong):
     assert unknown(dashboard_queries(json.loads(re.sub(rf"{name}\b", wrong, text)))) == {wrong}
 
 
-def test_what_is_no_query_is_found():
+def test_invalid_queries_are_found():
     with pytest.raises(ValueError, match="unclosed left parenthesis"):
         metric_names("sum by (run) (rate(ray_shoal_env_steps_total[1m])")
     with pytest.raises(ValueError, match="without a name"):
         metric_names('sum({run="a"})')
 
 
-def test_every_gauge_of_the_table_but_intervals_of_failures_is_on_the_dashboard_or_left_out_on_purpose():
+def test_every_gauge_is_on_the_dashboard_or_left_out_on_purpose():
     shown = {name for texts in dashboard_queries(dashboard()).values() for text in texts for name in metric_names(text)}
     failures = ("lost", "captured", "collision", "timeout")
     left_out = {f"ray_shoal_eval_{name}_rate_{end}" for name in failures for end in ("low", "high")}
@@ -74,7 +74,7 @@ def test_every_gauge_of_the_table_but_intervals_of_failures_is_on_the_dashboard_
 
 
 def grafanas_view(data):
-    """The dashboard after Grafana's own classes have read it and written it: what they do not know is gone."""
+    """The dashboard, read and written by Grafana's own classes, which drop unknown fields."""
     register_default_plugins()
     return json.loads(json.dumps(Dashboard.from_json(copy.deepcopy(data)), cls=JSONEncoder))
 
@@ -104,7 +104,7 @@ def test_a_misspelt_field_is_found(name, wrong):
     assert found and all(path.endswith(wrong) for path in found)
 
 
-def test_panels_stand_in_their_groups_without_overlap():
+def test_panels_are_in_their_groups_and_do_not_overlap():
     panels = dashboard()["panels"]
     assert [panel["title"] for panel in panels if panel["type"] == "row"] == GROUPS
     assert len({panel["id"] for panel in panels}) == len(panels)
@@ -118,7 +118,7 @@ def test_panels_stand_in_their_groups_without_overlap():
         }
         assert place["x"] + place["w"] <= 24 and not cells & taken
         taken |= cells
-        assert panel["type"] == "row" or panel["description"], "a panel says what is healthy"
+        assert panel["type"] == "row" or panel["description"], "a panel's description says what is healthy"
 
 
 def test_provisioning_fits_the_dashboard():

@@ -1,4 +1,4 @@
-"""The report's page: what it says was run, and how it compares presets."""
+"""The report's page: its coverage, and how it compares presets."""
 
 from __future__ import annotations
 
@@ -8,43 +8,44 @@ from collections.abc import Sequence
 from actors.evaluation.result_table import ResultRow
 from dashboards.analysis.aggregate import Results, Setup
 from dashboards.analysis.claims import judge
+from dashboards.analysis.comparison import baselines_of, presets_of
 from dashboards.figures.result_figures import PICTURES
-from dashboards.report import DRAWINGS, PresetPart, baselines_of, comparison, presets_of, report_markdown
+from dashboards.report import DRAWINGS, PresetSection, comparison, report_markdown
 from tests.dashboards.tables import claimed_table, fixed, row
 
 
-def part(name: str, rows: Sequence[ResultRow], folder: str = "") -> PresetPart:
+def section(name: str, rows: Sequence[ResultRow], folder: str = "") -> PresetSection:
     results = Results(rows)
-    return PresetPart(name, results, judge(results), folder, baselines_of(rows))
+    return PresetSection(name, results, judge(results), folder, baselines_of(rows))
 
 
-def test_presets_are_those_with_a_policy_and_thesis_comes_first():
+def test_presets_are_those_with_a_learned_policy_and_thesis_comes_first():
     rows = [row("sensor", Setup(5, 1), success=50, preset=name) for name in ("best", "thesis", "arena")]
     rows.append(row("sensor", Setup(5, 1), success=50, preset="baselines")._replace(policy="orca"))
     assert presets_of(rows) == ["thesis", "arena", "best"]
 
 
-def test_page_says_what_was_run():
+def test_the_page_states_its_sources_and_coverage():
     rows = [*claimed_table(), fixed("sensor", Setup(5, 1))._replace(seed=1, episodes=3000)]
-    page = report_markdown(["results.csv"], [part("thesis", rows)])
+    page = report_markdown(["results.csv"], [section("thesis", rows)])
     assert "`results.csv`" in page and "Presets side by side" not in page
     assert "| thesis | 75 | 10 | 1 … 2 | 258,000 |" in page
 
 
 def test_partial_tables_are_counted():
-    page = report_markdown(["half.csv"], [part("best", [fixed("out", Setup(5, 1)), fixed("in", Setup(5, 1))])])
+    page = report_markdown(["half.csv"], [section("best", [fixed("out", Setup(5, 1)), fixed("in", Setup(5, 1))])])
     assert "| best | 2 | 0 | 1 | 6,000 |" in page and "15 no data" in page
 
 
-def test_page_embeds_every_picture_with_words_for_it():
-    parts = [part("thesis", claimed_table(), "thesis/"), part("best", claimed_table(), "best/")]
+def test_the_page_embeds_every_picture_with_a_description():
+    parts = [section("thesis", claimed_table(), "thesis/"), section("best", claimed_table(), "best/")]
     links = re.findall(r"!\[([^\]]+)\]\(([^)]+)\)", report_markdown(["r.csv"], parts))
     wanted = [f"{name}/{picture.file}" for name in ("thesis", "best") for picture in PICTURES]
     assert [link for _, link in links] == wanted + [drawing.file for drawing in DRAWINGS]
     assert len({words for words, _ in links}) == len(links)
 
 
-def test_presets_are_compared_where_all_have_a_cell():
+def test_presets_are_compared_in_setups_that_all_have():
     small, middle, large = Setup(5, 1), Setup(10, 2), Setup(25, 8)
     first = [row("sensor", setup, success=share) for setup, share in ((small, 90), (middle, 80), (large, 10))]
     first.append(row("out", small, success=70))
@@ -59,18 +60,18 @@ def test_presets_are_compared_where_all_have_a_cell():
     ]
 
 
-def test_a_tie_is_nobodys():
+def test_a_tie_counts_for_nobody():
     rows = [row("out", Setup(5, 1), success=70)]
     assert "| M_OUT | 1 | 70.0 % | 70.0 % | 0 | 0 |" in comparison({"a": Results(rows), "b": Results(rows)})
 
 
-def test_baselines_stand_beside_the_learned_policies_of_the_same_setups():
+def test_baselines_are_shown_beside_the_learned_policies_of_the_same_setups():
     learned = [row("sensor", Setup(5, 1), success=90), row("sensor", Setup(10, 2), success=80)]
     greedy = [
         row("sensor", Setup(5, 1), success=95)._replace(policy="greedy"),
         row("sensor", Setup(25, 8), success=5)._replace(policy="greedy"),
     ]
-    page = report_markdown(["r.csv"], [part("thesis", [*learned, *greedy])])
+    page = report_markdown(["r.csv"], [section("thesis", [*learned, *greedy])])
     assert "| method | setups in all | learned | greedy | learned best in | greedy best in |" in page
     assert "| M_sensor | 1 | 90.0 % | 95.0 % | 0 | 1 |" in page
-    assert "rules that learn nothing" not in report_markdown(["r.csv"], [part("thesis", learned)])
+    assert "rules that learn nothing" not in report_markdown(["r.csv"], [section("thesis", learned)])

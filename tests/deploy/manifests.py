@@ -1,4 +1,4 @@
-"""Manifests, and the schemas that they must fit, for the tests of this folder."""
+"""Kubernetes manifests and their schemas, for the tests of this folder."""
 
 import copy
 import os
@@ -14,19 +14,19 @@ ROOT = Path(__file__).parents[2]
 KUBERNETES = ROOT / "deploy" / "kubernetes"
 PROMETHEUS = ROOT / "deploy" / "prometheus"
 CRDS = Path(os.environ.get("SHOAL_KUBERAY_CRDS") or ROOT.parent / "shared" / "data" / "kuberay")
-"""Folder of KubeRay's rayclusters.crd.yaml and rayjobs.crd.yaml, v1.7.0: its release, which we do not copy."""
+"""Folder of KubeRay's rayclusters.crd.yaml and rayjobs.crd.yaml, v1.7.0, from KubeRay's release."""
 RAY_KINDS = {"RayCluster": "rayclusters.crd.yaml", "RayJob": "rayjobs.crd.yaml"}
 CORE_VERSION = "1.33"
 PROMTOOL = shutil.which("promtool")
 
 
 class OnlyOnce(yaml.SafeLoader):
-    """YAML in which a key stands once."""
+    """A YAML loader that refuses duplicate keys."""
 
 
 def _mapping(loader, node):
     keys = [loader.construct_object(key) for key, _ in node.value]
-    assert len(keys) == len(set(keys)), f"a key stands twice {node.start_mark}"
+    assert len(keys) == len(set(keys)), f"a duplicate key {node.start_mark}"
     return loader.construct_mapping(node, deep=True)
 
 
@@ -52,7 +52,7 @@ def cluster_spec(document):
 
 
 def pod_templates(document):
-    """The pods that a manifest makes."""
+    """The templates of a manifest's pods."""
     if document["kind"] in RAY_KINDS:
         spec = cluster_spec(document)
         return [group["template"] for group in (spec["headGroupSpec"], *spec["workerGroupSpecs"])]
@@ -60,19 +60,19 @@ def pod_templates(document):
 
 
 def check_core(document) -> None:
-    """Raises kubernetes_validate.ValidationError unless Kubernetes' own schema has every field of `document`."""
+    """Raises kubernetes_validate.ValidationError if a field of `document` is not in Kubernetes' schema."""
     kubernetes_validate.validate(document, CORE_VERSION, strict=True)
 
 
 def check_pods(document) -> None:
-    """The pods of a manifest as `check_core` sees them."""
+    """Applies `check_core` to the pods of a manifest."""
     for template in pod_templates(document):
         metadata = {**template["metadata"], "name": "pod"}
         check_core({"apiVersion": "v1", "kind": "Pod", "metadata": metadata, "spec": template["spec"]})
 
 
 def _strict(schema) -> None:
-    """Makes a structural schema refuse fields that it does not name, as `kubectl --validate=strict` does."""
+    """Makes a structural schema refuse unknown fields, as `kubectl --validate=strict` does."""
     if schema.get("x-kubernetes-int-or-string"):
         schema.pop("type", None)
         schema["anyOf"] = [{"type": "integer"}, {"type": "string"}]
@@ -95,5 +95,5 @@ def _validator(kind: str) -> Draft202012Validator:
 
 
 def crd_errors(document) -> list[str]:
-    """What KubeRay's definition of the kind finds wrong."""
+    """Errors of a document against KubeRay's definition of its kind."""
     return [f"{error.json_path}: {error.message}" for error in _validator(document["kind"]).iter_errors(document)]

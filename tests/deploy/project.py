@@ -1,4 +1,4 @@
-"""What tests of deployment files need to know of the project and the machine."""
+"""Facts about the project and the machine, for tests of deployment files."""
 
 import io
 import socket
@@ -23,13 +23,13 @@ def instructions():
 
 
 def image_ray_version() -> str:
-    """The Ray that the image holds."""
+    """Ray's version in the image."""
     (value,) = [value for name, value in instructions() if name == "ARG" and value.startswith("RAY_VERSION=")]
     return value.partition("=")[2]
 
 
 def free_port() -> int:
-    """A port of the loopback that nothing listens on."""
+    """A free port of the loopback interface."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]

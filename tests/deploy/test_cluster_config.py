@@ -1,4 +1,4 @@
-"""`ray up`: our cluster file as Ray itself reads it."""
+"""The cluster file of `ray up`, read by Ray itself."""
 
 import copy
 import re
@@ -17,13 +17,13 @@ from tests.deploy.project import image_ray_version
 
 
 def check(config):
-    """What `ray up` does before it reaches out."""
+    """The checks of `ray up` before it connects to a machine."""
     prepared = prepare_config(copy.deepcopy(config))
     validate_config(prepared)
     return prepared
 
 
-def test_ray_takes_it():
+def test_ray_accepts_the_cluster_file():
     prepared = check(CONFIG)
     (kind,) = prepared["available_node_types"].values()
     assert kind["min_workers"] == kind["max_workers"] == len(CONFIG["provider"]["worker_ips"]) == 2
@@ -57,21 +57,21 @@ def test_a_misspelt_address_is_found():
 
 
 @pytest.mark.parametrize("name", ["head_start_ray_commands", "worker_start_ray_commands"])
-def test_ray_start_knows_every_flag_and_asks_for_the_token(name):
+def test_ray_start_knows_every_flag_and_requires_the_token(name):
     (command,) = [text for text in CONFIG[name] if " start " in text]
     _, found, arguments = command.partition("~/venv/bin/ray start ")
     assert found and "RAY_AUTH_MODE=token" in command
-    ray_start.make_context("start", shlex.split(arguments))  # click refuses what it does not know
+    ray_start.make_context("start", shlex.split(arguments))  # click refuses unknown flags
     assert "--metrics-export-port=8080" in arguments
 
 
-def test_the_ports_of_head_and_workers_fit():
+def test_workers_join_the_heads_port():
     head, worker = (" ".join(CONFIG[name]) for name in ("head_start_ray_commands", "worker_start_ray_commands"))
     (port,) = re.findall(r"--port=(\d+)", head)
     assert f"--address=$RAY_HEAD_IP:{port}" in worker
 
 
-def test_nodes_get_the_token_and_the_ray_of_the_image():
+def test_nodes_get_the_token_and_the_images_ray_version():
     assert CONFIG["file_mounts"]["~/.ray/auth_token"] == "~/.ray/auth_token"
     (install,) = [text for text in CONFIG["setup_commands"] if "pip install" in text]
     assert f"ray[default,tune]=={image_ray_version()}" in install

@@ -1,4 +1,4 @@
-"""The committed results: `shoal report` makes the committed report of them, and the presets are still theirs."""
+"""The committed results: `shoal report` reproduces the committed report, and the presets have not changed since."""
 
 import dataclasses
 import json
@@ -12,7 +12,7 @@ from PIL import Image
 import dashboards
 from actors.evaluation.result_table import LEARNED, read_table
 from deploy.cli import main
-from deploy.runs.sweep_provenance import grid_of, read_sittings
+from deploy.runs.sweep_provenance import grid_of, read_provenance
 from learner.config import RunConfig, to_dict
 from learner.sweep.grid import expected_hash, make_cell, sweep_of_label
 
@@ -24,21 +24,21 @@ def sweep_of(folder):
     return grid_of(json.loads((folder / "settings.json").read_text())["sweep"])
 
 
-def test_there_are_results():
+def test_there_are_committed_results():
     assert FOLDERS
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
-def test_the_commands_that_made_the_results_are_known(folder):
-    sittings = read_sittings(folder / "results.csv")
-    assert sittings and all(re.fullmatch("[0-9a-f]{40}", sitting.commit) for sitting in sittings)
+def test_the_provenance_of_the_results_is_known(folder):
+    provenance = read_provenance(folder / "results.csv")
+    assert provenance and all(re.fullmatch("[0-9a-f]{40}", each.commit) for each in provenance)
     seeds = {row.seed for row in read_table(folder / "results.csv") if row.policy == LEARNED}
-    told = [re.search(r"--seeds ([\d ]+)", sitting.command) for sitting in sittings]
+    told = [re.search(r"--seeds ([\d ]+)", each.command) for each in provenance]
     assert seeds == {int(seed) for found in told for seed in (found[1].split() if found else "012")}
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
-def test_the_report_is_that_of_the_results(folder, tmp_path):
+def test_the_committed_report_is_that_of_the_results(folder, tmp_path):
     assert main(["report", str(folder / "results.csv"), "--out", str(tmp_path)]) == 0
     made = {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()}
     assert made == {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()} - {
@@ -48,14 +48,14 @@ def test_the_report_is_that_of_the_results(folder, tmp_path):
     for name in made:
         if name.suffix == ".md":
             assert (folder / name).read_text() == (tmp_path / name).read_text()
-        else:  # another version of the plotting library may move letters by a pixel
+        else:  # another version of matplotlib may move letters by a pixel
             committed, new = (np.asarray(Image.open(root / name).convert("RGB"), float) for root in (folder, tmp_path))
             assert committed.shape == new.shape
             assert np.abs(committed - new).mean() < 2.0
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
-def test_the_rows_are_of_the_preset_as_it_is(folder):
+def test_the_rows_have_the_presets_current_settings(folder):
     sweep = sweep_of(folder)
     rows = [row for row in read_table(folder / "results.csv") if row.policy == LEARNED]
     assert rows
@@ -65,8 +65,8 @@ def test_the_rows_are_of_the_preset_as_it_is(folder):
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
-def test_no_default_has_moved_under_the_results(folder):
-    # The hash leaves out what is as by default, so a default that changes must show here.
+def test_no_default_has_changed_since_the_results(folder):
+    # The hash leaves out defaults, so that a changed default must be found here.
     stored = json.loads((folder / "settings.json").read_text())["a_cell_of_each_method"]
     assert stored
     for method, values in stored.items():
@@ -83,7 +83,7 @@ TRIED = sorted((ROOT / "tried").glob("*.csv"))
 
 
 @pytest.mark.parametrize("table", TRIED, ids=lambda table: table.stem)
-def test_what_was_tried_is_what_its_label_says(table):
+def test_tables_of_experiments_have_the_settings_of_their_labels(table):
     rows = read_table(table)
     assert rows
     for row in rows:

@@ -1,4 +1,4 @@
-"""The container file: a linter's word, a parser's view of it, and the wheel that its context builds."""
+"""The container file: linted, parsed, and its build context built into a wheel."""
 
 import re
 import shutil
@@ -21,7 +21,7 @@ def lint(path: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([HADOLINT, "--no-color", path], capture_output=True, text=True, check=False)
 
 
-def test_the_linter_has_nothing_to_say():
+def test_the_linter_reports_nothing():
     done = lint(CONTAINERFILE)
     assert (done.returncode, done.stdout) == (0, "")
 
@@ -49,7 +49,7 @@ def test_it_does_not_run_as_root():
     assert user == "1000:1000", "the user of the manifests' pods"
 
 
-def test_ray_is_of_a_version_that_the_project_takes():
+def test_the_ray_version_satisfies_the_projects_requirement():
     (wanted,) = [Requirement(line) for line in project()["dependencies"] if Requirement(line).name == "ray"]
     assert wanted.specifier.contains(image_ray_version())
     (install,) = [value for value in values("RUN") if "pip install" in value]
@@ -57,7 +57,7 @@ def test_ray_is_of_a_version_that_the_project_takes():
 
 
 def context() -> set[str]:
-    """Files that the build sees: those that git does not ignore, less what the ignore file leaves out."""
+    """Files in the build context: those that neither git nor the container's ignore file ignores."""
     patterns = [line for line in IGNORED.read_text().splitlines() if line and not line.startswith("#")]
     seen = exclude_paths(str(ROOT), patterns)
     listed = subprocess.run(
@@ -71,7 +71,7 @@ def context() -> set[str]:
 
 @pytest.fixture(scope="module")
 def copied(tmp_path_factory):
-    """The folder that the COPY instructions make of the context."""
+    """A folder with the files that the COPY instructions copy."""
     folder = tmp_path_factory.mktemp("image")
     files = context()
     for value in values("COPY"):
@@ -87,7 +87,7 @@ def copied(tmp_path_factory):
     return folder
 
 
-def test_the_context_holds_no_more_than_is_copied(copied):
+def test_the_build_context_holds_only_what_is_copied(copied):
     left = {str(path.relative_to(copied)) for path in copied.rglob("*") if path.is_file()}
     assert left == context()
     assert not [name for name in left if name.startswith(("tests/", "runs/", "dashboards/results/", "."))]
@@ -101,7 +101,7 @@ def test_the_copied_files_build_a_wheel_with_every_package(copied, tmp_path):
     (wheel,) = tmp_path.glob("shoal-*.whl")
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    kept = [name for name in context() if not name.startswith("deploy/examples/")]  # to read, not to import
+    kept = [name for name in context() if not name.startswith("deploy/examples/")]  # examples are not packaged
     sources = {name for name in kept if name.endswith(".py") or name.startswith("dashboards/web/")}
     assert sources <= names
     assert {"learner/ray_backend/cluster.py", "sim_core/methods/m_sensor.py", "dashboards/web/player.js"} <= sources

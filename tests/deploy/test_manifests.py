@@ -34,7 +34,7 @@ CORE = {name: document for name, document in DOCUMENTS.items() if name not in RA
 needs_crds = pytest.mark.skipif(not CRDS.is_dir(), reason=f"KubeRay's definitions are not in {CRDS}")
 
 
-def test_what_the_operators_page_names_is_there():
+def test_objects_named_by_the_operators_page_exist():
     assert set(RAY) == {"RayCluster/shoal", "RayJob/shoal-sweep"}
     assert {"Deployment/shoal-mlflow", "Service/shoal-mlflow", "PersistentVolumeClaim/shoal-runs"} <= set(CORE)
 
@@ -111,14 +111,14 @@ def test_a_misspelt_field_of_a_ray_object_is_found(name, path, wrong):
 
 @needs_crds
 @pytest.mark.parametrize("value", ["tokens", 3])
-def test_a_value_that_kuberay_does_not_know_is_found(value):
+def test_a_value_unknown_to_kuberay_is_found(value):
     document = copy.deepcopy(RAY["RayCluster/shoal"])
     document["spec"]["authOptions"]["mode"] = value
     assert any("$.spec.authOptions.mode" in error for error in crd_errors(document))
 
 
 @pytest.mark.parametrize("name", RAY)
-def test_every_ray_asks_for_the_token_and_is_of_the_images_version(name):
+def test_every_ray_requires_the_token_and_has_the_images_version(name):
     spec = cluster_spec(RAY[name])
     assert spec["authOptions"] == {"mode": "token"}
     assert spec["rayVersion"] == image_ray_version()
@@ -134,7 +134,7 @@ def test_the_job_runs_on_pods_like_the_clusters():
     assert cluster == job
 
 
-def test_the_jobs_command_is_one_of_ours():
+def test_the_jobs_command_parses():
     command, *arguments = shlex.split(RAY["RayJob/shoal-sweep"]["spec"]["entrypoint"])
     assert command == "shoal"
     parsed = parse(arguments)
@@ -178,7 +178,7 @@ def test_volumes_and_services_that_pods_name_exist():
             assert not found or (found[1], int(found[2])) in services
 
 
-def test_pods_have_bounds_and_few_rights():
+def test_pods_have_resource_limits_and_few_rights():
     for document in DOCUMENTS.values():
         for pod in pod_templates(document):
             assert pod["spec"]["securityContext"]["runAsNonRoot"] is True

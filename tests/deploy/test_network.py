@@ -1,4 +1,4 @@
-"""Which pods Kubernetes' network policies let through to the pods of Ray and MLflow."""
+"""Which pods can connect to the pods of Ray and MLflow under the network policies."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from tests.deploy.manifests import documents
 
 POLICIES = [document for document in documents().values() if document["kind"] == "NetworkPolicy"]
 OURS = {"app.kubernetes.io/part-of": "shoal"}
-RAY = {**OURS, "ray.io/is-ray-node": "yes"}  # the second is KubeRay's own
+RAY = {**OURS, "ray.io/is-ray-node": "yes"}  # the second label is KubeRay's
 MLFLOW = {**OURS, "app.kubernetes.io/name": "shoal-mlflow"}
 PROMETHEUS = {"app.kubernetes.io/name": "prometheus"}
 OPERATOR = {"app.kubernetes.io/name": "kuberay-operator"}
@@ -21,7 +21,7 @@ def fits(selector, labels) -> bool:
 def admits(to, port, labels, at_home) -> bool:
     """Whether a pod with `labels`, in the cluster's namespace or another, reaches a port of a pod with labels `to`."""
     policies = [policy["spec"] for policy in POLICIES if fits(policy["spec"]["podSelector"], to)]
-    assert policies, "without a policy for it, a pod is open to all"
+    assert policies, "a pod without a policy accepts all connections"
 
     def is_peer(peer) -> bool:
         assert peer.keys() <= {"podSelector", "namespaceSelector"}
@@ -41,14 +41,14 @@ def admits(to, port, labels, at_home) -> bool:
     [
         (RAY, True, {GCS, DASHBOARD, METRICS}),
         (RAY, False, set()),
-        ({}, True, {DASHBOARD}),  # a job's submitter, which shows the token
+        ({}, True, {DASHBOARD}),  # a job's submitter, which sends the token
         ({}, False, set()),
         (MLFLOW, True, {DASHBOARD}),
         (PROMETHEUS, False, {METRICS}),
         (OPERATOR, False, {DASHBOARD}),
     ],
 )
-def test_rays_pods_are_open_to_themselves_and_by_one_port_to_others(labels, at_home, ports):
+def test_ray_pods_reach_each_other_and_others_reach_one_port(labels, at_home, ports):
     assert {port for port in (GCS, DASHBOARD, METRICS, 12_345) if admits(RAY, port, labels, at_home)} - {
         12_345
     } == ports
@@ -56,5 +56,5 @@ def test_rays_pods_are_open_to_themselves_and_by_one_port_to_others(labels, at_h
 
 
 @pytest.mark.parametrize(("labels", "at_home"), [({}, True), (RAY, True), ({}, False), (PROMETHEUS, False)])
-def test_mlflow_is_open_to_its_namespace_alone(labels, at_home):
+def test_only_its_namespace_reaches_mlflow(labels, at_home):
     assert admits(MLFLOW, SERVER, labels, at_home) == at_home

@@ -1,4 +1,4 @@
-"""The operator's page: its sizes follow from the measured numbers that it names, its commands and files exist."""
+"""The operator's page: its sizes follow from the benchmarks that it cites; its commands and files exist."""
 
 import math
 import re
@@ -21,7 +21,7 @@ def number(text: str) -> float:
 
 
 def benchmark(row: str, column: int) -> float:
-    """A number of the benchmark tables: the first in the column of the first row that has this text."""
+    """A number in the benchmark tables: the first in this column of the first row with this text."""
     line = next(line for line in MEASURED.splitlines() if line.startswith("│") and row in line)
     return number(re.search(r"[\d,.]+", line.split("│")[column])[0])
 
@@ -49,7 +49,7 @@ def model():
     return number(worker), number(simulator), number(full)
 
 
-def test_workers_of_a_learner_follow_from_the_benchmarks(model):
+def test_workers_per_learner_follow_from_the_benchmarks(model):
     worker, simulator, taken_up = model
     assert f"full at {taken_up:,.0f} env steps/s with 2 samples" in TEXT
     for setup, rate, workers, cpus in table("setup"):
@@ -63,7 +63,7 @@ def test_workers_of_a_learner_follow_from_the_benchmarks(model):
         assert int(cpus) == int(workers) + 2, "the learner and the driver"
 
 
-def test_what_fits_on_nodes_follows_from_the_table_of_setups():
+def test_trainings_per_node_follow_from_the_table_of_setups():
     needs = {setup: int(cpus) for setup, _, _, cpus in table("setup")}
     for nodes, trainings, cells, _ in table("nodes"):
         assert int(cells) == CELLS_A_NODE * int(nodes)
@@ -73,7 +73,7 @@ def test_what_fits_on_nodes_follows_from_the_table_of_setups():
         assert int(count) == CELLS_A_NODE * int(nodes) // needs[setup]
 
 
-def test_commands_of_ours_are_understood():
+def test_shoal_commands_parse():
     commands = re.findall(r"(?:^|[ /])shoal ((?:train|sweep) [^'\n#]*?)\s*(?:['#]|$)", PAGE, re.MULTILINE)
     assert len(commands) >= 4
     for command in commands:

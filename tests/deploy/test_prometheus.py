@@ -1,4 +1,4 @@
-"""Prometheus' configuration and alerts, read by Prometheus' own tool."""
+"""Prometheus' configuration and alerts, checked by promtool."""
 
 import shutil
 import subprocess
@@ -17,7 +17,7 @@ def check(folder, name):
 
 @needs_promtool
 @pytest.mark.parametrize("name", CONFIGS)
-def test_prometheus_takes_the_configuration_and_its_alerts(name):
+def test_prometheus_accepts_the_configuration_and_its_alerts(name):
     done = check(PROMETHEUS, name)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "4 rules found" in done.stdout
@@ -33,7 +33,7 @@ def test_prometheus_takes_the_configuration_and_its_alerts(name):
         ("alerts.yml", "sum(rate(", "sum(rat("),
     ],
 )
-def test_what_is_misspelt_is_found(tmp_path, name, right, wrong):
+def test_misspelt_settings_are_found(tmp_path, name, right, wrong):
     for path in PROMETHEUS.glob("*.yml"):
         shutil.copy(path, tmp_path)
     text = (PROMETHEUS / name).read_text()
@@ -48,7 +48,7 @@ def test_what_is_misspelt_is_found(tmp_path, name, right, wrong):
     ("steps", "state", "fires"),
     [("0+100x30", "ALIVE_IDLE", False), ("5000+0x30", "ALIVE_IDLE", True), ("5000+0x30", "DEAD", False)],
 )
-def test_a_learner_without_env_steps_raises_the_alert(tmp_path, steps, state, fires):
+def test_a_learner_without_progress_raises_the_alert(tmp_path, steps, state, fires):
     alert = "{exp_labels: {severity: page}, exp_annotations: {summary: SUMMARY}}"
     (group,) = read_yaml(PROMETHEUS / "alerts.yml")[0]["groups"]
     (rule,) = [rule for rule in group["rules"] if rule["alert"] == "ShoalStandsStill"]
@@ -73,18 +73,18 @@ tests:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_in_kubernetes_the_service_that_is_asked_selects_the_pods_of_ray():
+def test_the_scraped_kubernetes_service_selects_rays_pods():
     manifests = documents()
     (config,) = read_yaml(PROMETHEUS / "prometheus-kubernetes.yml")
     (places,) = config["scrape_configs"][0]["dns_sd_configs"]
     (name,) = places["names"]
     service = manifests[f"Service/{name}"]["spec"]
-    assert service["clusterIP"] == "None", "its name resolves to every pod"
+    assert service["clusterIP"] == "None", "a headless service: its name resolves to every pod"
     (port,) = service["ports"]
     assert port["port"] == places["port"]
     spec = cluster_spec(manifests["RayCluster/shoal"])
     for group in (spec["headGroupSpec"], *spec["workerGroupSpecs"]):
-        labels = group["template"]["metadata"]["labels"] | {"ray.io/is-ray-node": "yes"}  # which KubeRay adds
+        labels = group["template"]["metadata"]["labels"] | {"ray.io/is-ray-node": "yes"}  # KubeRay adds the second
         assert service["selector"].items() <= labels.items()
         assert group["rayStartParams"]["metrics-export-port"] == str(places["port"])
         ports = {known["name"]: known["containerPort"] for known in group["template"]["spec"]["containers"][0]["ports"]}

@@ -1,4 +1,4 @@
-"""The client of Ray's job server, beside servers of our own that refuse, break off, or are not there."""
+"""The client of Ray's job server, against test servers that refuse, disconnect, or do not exist."""
 
 import asyncio
 import socket
@@ -22,7 +22,7 @@ LOG = "".join(f"line {i}\n" for i in range(100))
 
 @pytest.fixture(autouse=True)
 def no_cluster(monkeypatch, tmp_path):
-    """An environment that names no cluster, and no token but that of this process; it is put back."""
+    """An environment that names no cluster and no token file, restored after the test."""
     for name in ("RAY_API_SERVER_ADDRESS", "RAY_ADDRESS", "RAY_AUTH_TOKEN_PATH"):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
@@ -31,7 +31,7 @@ def no_cluster(monkeypatch, tmp_path):
 
 @contextmanager
 def serving(*routes: web.RouteDef):
-    """A server of these routes on a free port of this machine; gives its address."""
+    """Serves these routes on a free port of this machine; yields the address."""
     loop, ready, address = asyncio.new_event_loop(), threading.Event(), []
 
     async def start() -> web.AppRunner:
@@ -86,7 +86,7 @@ def test_a_cluster_that_asks_for_a_token_is_explained(status):
     assert "\n" not in text
 
 
-def test_nobody_there_is_one_sentence():
+def test_an_unreachable_server_is_reported_in_one_sentence():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
@@ -94,12 +94,12 @@ def test_nobody_there_is_one_sentence():
             JobServer(address)
 
 
-def test_an_address_of_another_kind_is_refused():
+def test_an_address_with_another_scheme_is_refused():
     with pytest.raises(ConfigError, match="--address must be a dashboard"):
         JobServer("ray://127.0.0.1:10001")
 
 
-def test_the_given_address_goes_before_the_environment(monkeypatch):
+def test_the_given_address_overrides_the_environment(monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     monkeypatch.setenv("RAY_API_SERVER_ADDRESS", "http://127.0.0.1:2")
     with serving(version()) as address:
@@ -115,7 +115,7 @@ def test_the_given_address_goes_before_the_environment(monkeypatch):
         ({}, False),
     ],
 )
-def test_a_token_travels_where_there_is_one(environment, travels):
+def test_a_token_is_sent_if_there_is_one(environment, travels):
     seen = []
 
     async def answer(request: web.Request) -> web.Response:
@@ -125,7 +125,7 @@ def test_a_token_travels_where_there_is_one(environment, travels):
     with serving(web.get("/api/version", answer)) as address:
         command = [sys.executable, "-m", "deploy", "submit", "--address", address, "train"]
         done = subprocess.run(command, cwd=ROOT, env={**clean_environment(), **environment}, timeout=120, check=False)
-    assert done.returncode == 2, "there are no jobs here"
+    assert done.returncode == 2, "the server has no jobs"
     assert set(seen) == {f"Bearer {TOKEN}" if travels else None}
 
 
@@ -133,7 +133,7 @@ def job_info(status: str) -> dict:
     return {"type": "SUBMISSION", "submission_id": "j", "status": status, "entrypoint": "e", "driver_exit_code": 3}
 
 
-def test_a_log_goes_on_behind_what_was_written_when_the_connection_breaks():
+def test_a_log_continues_where_a_broken_connection_left_it():
     connections = []
 
     async def tail(request: web.Request) -> web.WebSocketResponse:
@@ -187,7 +187,7 @@ def test_a_job_is_stopped_once_and_followed_to_its_end():
     assert ending.status == "STOPPED"
 
 
-def test_attempts_are_those_of_the_name_in_order():
+def test_attempts_are_those_of_the_name_in_numeric_order():
     async def jobs(request: web.Request) -> web.Response:
         ended = {"a-1": "FAILED", "a-10": "RUNNING", "a-2": "STOPPED", "a-b-3": "RUNNING", "other-4": "PENDING"}
         return web.json_response([{**job_info(status), "submission_id": key} for key, status in ended.items()])

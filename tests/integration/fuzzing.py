@@ -25,6 +25,8 @@ import deploy.commands.evaluate
 import deploy.commands.report
 import deploy.commands.sweep
 import deploy.commands.train
+import deploy.commands.watch
+import deploy.training
 from deploy.cli import BAD_INPUT, main
 from learner.config import RunConfig
 from learner.run_folder import RunFolder, RunIdentity
@@ -84,9 +86,11 @@ def workplace(folder: Path) -> Iterator[None]:
     (folder / "a-file").write_text("of no use")
     (folder / "results.csv").write_text("preset,policy\n")
     ports = {
-        deploy.commands.train: ("execute", "Tracker"),
+        deploy.training: ("execute", "Tracker"),
+        deploy.commands.train: ("Tracker",),
         deploy.commands.sweep: ("run_cells", "Tracker"),
-        deploy.commands.evaluate: ("evaluate_in_tasks", "record_episode", "foreign_animation"),
+        deploy.commands.evaluate: ("evaluate_in_tasks", "record_episode"),
+        deploy.commands.watch: ("record_episode", "foreign_animation"),
         deploy.commands.report: ("_write",),
     }
     with pytest.MonkeyPatch.context() as patch:

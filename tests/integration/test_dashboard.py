@@ -20,7 +20,7 @@ from actors.evaluation.result_table import read_table, write_table
 from deploy.cli import main
 from deploy.commands.dashboard import report_server
 from deploy.live import live_server
-from deploy.report_data.sources import find_source
+from deploy.report_data.sources import find_report_source
 from deploy.runs.policy_lookup import find_policy
 from learner.checkpoints.checkpoint import newest_valid
 from learner.loop import TrainingLoop
@@ -150,7 +150,7 @@ def test_a_served_report_follows_the_sweep(browser, sweep, tmp_path):
     hidden = [path for path in folder.glob("cells/*5r2g*")]
     for path in hidden:
         path.rename(tmp_path / path.name)
-    with serving(report_server(find_source(str(folder), tmp_path), 0)) as url:
+    with serving(report_server(find_report_source(str(folder), tmp_path), 0)) as url:
         open_report(browser, url)
         rate = "document.querySelector('#success .plot').data[0].z[0]"
         wait_until(browser, f"{rate}[0] !== null && {rate}[1] === null")
@@ -177,7 +177,7 @@ def test_a_served_report_follows_the_sweep(browser, sweep, tmp_path):
 
 
 def test_curves_and_speeds_are_the_journals(sweep):
-    data = {chart.key: chart for chart in find_source(str(sweep), sweep).contents().charts}
+    data = {chart.key: chart for chart in find_report_source(str(sweep), sweep).contents().charts}
     journal = next(sweep.glob("cells/sensor-5r2g*/metrics.jsonl"))
     measured = [row for row in read_rows(journal) if "eval/success_rate" in row.metrics]
     low, high, line = data["curves"].views["5r×2g"].panels[0].figure["data"]

@@ -6,7 +6,7 @@ import re
 import mlflow
 import pytest
 
-from deploy.chaos.checks import complaints
+from deploy.chaos.invariants import broken_invariants
 from deploy.chaos.processes import TrackingServer
 from learner.run_folder import RunFolder
 from learner.tracking.journal import PushedMark
@@ -52,7 +52,7 @@ def test_metrics_of_an_outage_of_mlflow_arrive_later_and_once(server, tmp_path):
     assert "MLflow does not take the metrics, they are kept and sent again" in output
     assert "MLflow takes the metrics again; none is missing" in output
     assert "Traceback" not in output
-    assert complaints(folder) == []
+    assert broken_invariants(folder) == []
 
 
 @pytest.mark.ray

@@ -6,12 +6,12 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
-from deploy.chaos.checks import complaints
+from deploy.chaos.invariants import broken_invariants
+from learner.placement import Place
 from learner.run import execute
 from learner.run_folder import RunFolder, RunIdentity
 from learner.tracking.fault_log import read_faults
 from learner.tracking.mlflow_run import Tracker
-from learner.training.cluster import Place
 from tests.integration.conftest import SMALL
 
 pytestmark = [
@@ -69,4 +69,4 @@ def test_a_removed_node_costs_no_run(cluster, tmp_path):
     assert result.env_steps >= 30_000 and result.evaluation is not None, display.messages
     log = read_faults(folder.faults)
     assert {entry.event for entry in log} >= {"failed", "mended"}, display.messages
-    assert complaints(folder) == []
+    assert broken_invariants(folder) == []

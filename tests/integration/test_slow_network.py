@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.chaos.checks import complaints
+from deploy.chaos.invariants import broken_invariants
 from learner.checkpoints.checkpoint import finished_names
 from learner.checkpoints.store import env_steps_of
 from learner.run_folder import RunFolder
@@ -121,4 +121,4 @@ def test_a_run_outlives_a_slow_and_a_cut_cable(wired, tmp_path):
             kill(job)
     assert env_steps_of(finished_names(folder.checkpoint_location())[0]) >= CONFIG.total_env_steps
     assert {entry.event for entry in read_faults(folder.faults)} >= {"failed", "mended"}, log.read_text()
-    assert complaints(folder) == []
+    assert broken_invariants(folder) == []

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from deploy.chaos.checks import complaints
+from deploy.chaos.invariants import broken_invariants
 from learner.run_folder import RunFolder
 from learner.tracking.fault_log import read_faults
 from tests.integration.conftest import SMALL
@@ -54,4 +54,4 @@ def test_a_submitted_job_outlives_a_node(tmp_path):
     faults = read_faults(folder.faults)
     assert {entry.event for entry in faults} >= {"failed", "mended"}, text
     assert re.search(r"works again after|going on from", text), text
-    assert complaints(folder) == []
+    assert broken_invariants(folder) == []

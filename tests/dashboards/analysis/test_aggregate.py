@@ -8,8 +8,8 @@ import pytest
 from actors.evaluation.statistics import Estimate, rate
 from dashboards.analysis.aggregate import (
     GROUPS,
-    Cell,
-    Measured,
+    Measurement,
+    PooledCell,
     Results,
     Setup,
     average,
@@ -28,8 +28,8 @@ from tests.dashboards.tables import claimed_table, fixed, row
 HOME = Setup(10, 2)
 
 
-def of(count: int, total: int) -> Measured:
-    return Measured(rate(count, total), total)
+def of(count: int, total: int) -> Measurement:
+    return Measurement(rate(count, total), total)
 
 
 def test_seeds_are_pooled_by_their_counts():
@@ -49,8 +49,8 @@ def test_one_seed_has_no_range():
 
 
 @pytest.mark.parametrize("rates", [[0.8] * 5, [0.95, 0.85, 0.7, 0.6, 0.4]])
-def test_intervals_over_seeds_cover_the_method_not_these_policies(rates: list[float]):
-    """Policies' true rates vary (beta distributed): a rate's interval holds the mean of all that could be trained."""
+def test_intervals_over_seeds_cover_the_methods_mean_not_that_of_these_policies(rates: list[float]):
+    """True rates of policies vary (beta distributed). A rate's interval covers the mean over all possible policies."""
     rng, hits, binomial, rounds = np.random.default_rng(2), 0, 0, 300
     for _ in range(rounds):
         rows = [
@@ -69,7 +69,7 @@ def test_intervals_over_seeds_cover_the_method_not_these_policies(rates: list[fl
     assert binomial / (rounds * len(rates)) < 0.4
 
 
-def test_one_method_does_not_widen_another():
+def test_one_methods_overdispersion_does_not_widen_anothers_intervals():
     rows = [row("sensor", HOME, success=90, seed=seed) for seed in (0, 1)]
     rows += [row("out", HOME, success=success_percent, seed=seed) for seed, success_percent in enumerate((95, 50))]
     results = Results(rows)
@@ -133,12 +133,12 @@ def test_a_swapped_difference_changes_its_sign():
     assert forth.estimate == pytest.approx((-back.estimate.value, -back.estimate.high, -back.estimate.low))
 
 
-def test_mean_weighs_cells_alike_whatever_their_episodes():
+def test_the_mean_weights_cells_equally():
     found = average([of(100, 100), of(0, 900)])
     assert found is not None and found.estimate.value == pytest.approx(0.5)
 
 
-def test_interval_of_a_mean_covers_the_truth_as_often_as_it_says():
+def test_the_interval_of_a_mean_has_its_coverage():
     truth, rng = np.array([0.02, 0.1, 0.3, 0.5, 0.9]), np.random.default_rng(0)
     hits = 0
     for counts in rng.binomial(100, truth, size=(1000, 5)):
@@ -148,25 +148,25 @@ def test_interval_of_a_mean_covers_the_truth_as_often_as_it_says():
     assert 0.93 <= hits / 1000 <= 0.98
 
 
-def test_interval_of_lost_less_captured_knows_that_one_excludes_the_other():
-    """Taken for independent, they would cover only 90 % here."""
+def test_the_interval_of_lost_minus_captured_uses_their_correlation():
+    """An interval that took the two as independent would cover only 90 % here."""
     rng = np.random.default_rng(1)
     hits = 0
     for gone, taken, _ in rng.multinomial(200, [0.3, 0.3, 0.4], size=2000):
         made = row("sensor", HOME, success=0, episodes=200)._replace(lost=int(gone), captured=int(taken))
-        estimate = Cell((made,)).lost_less_captured().estimate
+        estimate = PooledCell((made,)).lost_minus_captured().estimate
         hits += estimate.low <= 0.0 <= estimate.high
     assert 0.935 <= hits / 2000 <= 0.97
 
 
-def test_lost_less_captured_without_either_or_with_nothing_else():
-    none = Cell((row("sensor", HOME, success=100),)).lost_less_captured().estimate
+def test_lost_minus_captured_at_its_limits():
+    none = PooledCell((row("sensor", HOME, success=100),)).lost_minus_captured().estimate
     assert none.value == 0 and none.low == -none.high
-    only = Cell((row("sensor", HOME, success=0, lost=100),)).lost_less_captured().estimate
+    only = PooledCell((row("sensor", HOME, success=0, lost=100),)).lost_minus_captured().estimate
     assert only.value == 1 and only.low > 0.99
 
 
-def test_a_missing_part_is_missing_in_the_whole():
+def test_a_missing_term_makes_the_sum_missing():
     assert weighted_sum([(1.0, of(1, 2)), (-1.0, None)]) is None
     assert average([None, of(1, 2)]) is None
 

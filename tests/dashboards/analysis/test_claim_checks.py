@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from actors.evaluation.statistics import Estimate
-from dashboards.analysis.aggregate import Measured
+from dashboards.analysis.aggregate import Measurement
 from dashboards.analysis.claim_checks import (
     Check,
     Claim,
@@ -23,8 +23,8 @@ from dashboards.analysis.claim_checks import (
 HOLDS, FAILS, UNDECIDED, NO_DATA = Verdict.HOLDS, Verdict.FAILS, Verdict.UNDECIDED, Verdict.NO_DATA
 
 
-def measured(value: float, low: float, high: float) -> Measured:
-    return Measured(Estimate(value, low, high), 100)
+def measured(value: float, low: float, high: float) -> Measurement:
+    return Measurement(Estimate(value, low, high), 100)
 
 
 @pytest.mark.parametrize(

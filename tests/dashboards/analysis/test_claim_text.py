@@ -14,7 +14,7 @@ def judged(*changed: object, without: tuple[object, ...] = ()) -> list[Claim]:
     return judge(Results(claimed_table(*changed, without=without)))  # type: ignore[arg-type]
 
 
-def test_table_has_a_row_a_claim_with_its_verdict():
+def test_the_table_has_one_row_per_claim_with_its_verdict():
     lines = verdict_table(judged(fixed("sensor", Setup(25, 1), success=75), without=(fixed("out", Setup(15, 8)),)))
     assert lines[0] == "| # | claim | verdict | evidence |"
     cells = [line.split(" | ") for line in lines[2:]]
@@ -23,7 +23,7 @@ def test_table_has_a_row_a_claim_with_its_verdict():
     assert verdicts[1] == "**does not hold**" and verdicts[2] == "**holds**" and verdicts[14] == "no data"
 
 
-def test_evidence_of_a_short_claim_is_all_its_numbers():
+def test_evidence_of_a_short_claim_has_all_its_numbers():
     claim = judged(fixed("sensor", Setup(25, 2), success=80))[4]
     assert evidence(claim) == (
         "10r×2g 92.0 % (91.0 … 92.9); 25r×2g 80.0 % (78.5 … 81.4) (does not hold); "
@@ -40,7 +40,7 @@ def test_evidence_over_all_setups_counts_them_and_names_those_that_do_not_hold()
     )
 
 
-def test_evidence_counts_what_is_missing_where_it_is_much():
+def test_evidence_counts_missing_checks_if_there_are_many():
     claims = judged(without=tuple(fixed("in", setup) for setup in SETUPS))
     assert evidence(claims[10]) == "holds in 0 of 25 setups; no data: 25 checks"
 
@@ -54,7 +54,7 @@ def test_details_show_every_check_with_its_numbers():
     assert f"| 5r×1g | ≈ 100 % (90 … 100 %) | {measured} | 2: 90.0 … 94.0 % | 6,000 | holds |" in lines
 
 
-def test_tally_leaves_out_what_there_is_none_of():
+def test_the_tally_leaves_out_verdicts_without_claims():
     assert tally(judged()) == "15 holds"
     assert tally(judged(fixed("in", Setup(10, 1), success=60))) == "14 holds, 1 does not hold"
 
@@ -65,6 +65,6 @@ def test_page_has_each_preset():
     assert page.count("### 15. ") == 2 and page.endswith("|\n")
 
 
-def test_a_bar_in_a_name_breaks_no_table():
+def test_a_vertical_bar_in_a_name_breaks_no_table():
     line = verdict_table([Claim(1, "a|b", [at_least("x", None, 0.5), rises("y", None)])])[2]
     assert line.replace(r"\|", "").count("|") == 5

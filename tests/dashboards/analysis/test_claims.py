@@ -1,4 +1,4 @@
-"""The fifteen claims on a table that agrees with all of them, and on tables in which one cell does not."""
+"""The fifteen claims, on a table that agrees with all of them, and on tables in which one cell disagrees."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def claim(number: int, rows: list[ResultRow]) -> Claim:
 
 
 def failing(number: int, *changed: ResultRow) -> list[str]:
-    """Names of the checks of a claim that do not hold."""
+    """Names of a claim's checks that do not hold."""
     return [check.name for check in claim(number, claimed_table(*changed)).checks if check.verdict is FAILS]
 
 
-def test_there_are_fifteen_and_the_made_up_table_agrees_with_all():
+def test_there_are_fifteen_claims_and_the_synthetic_table_agrees_with_all():
     assert len(CLAIMS) == 15
     assert verdicts() == dict.fromkeys(range(1, 16), HOLDS)
 
@@ -111,11 +111,11 @@ def test_every_claim_can_be_refuted():
         (sensor(15, 4, success=70), set()),
     ],
 )
-def test_a_cell_refutes_no_claim_that_is_not_about_it(changed: ResultRow, refuted: set[int]):
+def test_a_cell_refutes_only_claims_about_it(changed: ResultRow, refuted: set[int]):
     assert {number for number, verdict in verdicts(changed).items() if verdict is not HOLDS} == refuted
 
 
-def test_mostly_by_collision_is_of_all_failures():
+def test_mostly_by_collision_is_a_share_of_all_failures():
     lost_instead = [fixed("in", setup, success=30, lost=40, collision=20) for setup in SETUPS]
     assert failing(12, *lost_instead) == ["collisions among failures"]
     assert verdicts(*lost_instead[:3])[12] is HOLDS

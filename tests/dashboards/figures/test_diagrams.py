@@ -1,4 +1,4 @@
-"""The diagrams, checked against numpy on the state that they are drawn from."""
+"""The diagrams, checked with numpy on the state that they are drawn from."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def pushed() -> WorldBatch:
 
 
 def seen_by_hand(worlds: WorldBatch) -> tuple[np.ndarray, np.ndarray, int]:
-    """Offsets of the other robots, which of them are of the own group, and the learning robot."""
+    """Offsets of the other robots, whether each is of the own group, and the learning robot's index."""
     learner, robots = int(worlds.state.learner[0]), worlds.config.robots
     position = worlds.positions()[0].astype(np.float64)
     others = np.delete(np.arange(len(position)), learner)
@@ -59,7 +59,7 @@ def arrow_tips(figure: Figure, axes: int) -> list[tuple[float, float]]:
     return [text.xy for text in arrows]  # type: ignore[attr-defined]
 
 
-def test_scene_is_the_step_with_most_robots_in_range(near: WorldBatch):
+def test_the_scene_is_the_step_with_most_robots_in_range(near: WorldBatch):
     worlds = WorldBatch(SENSOR_WORLD, 1)
     worlds.seed([EPISODE_SEED])
     worlds.reset()
@@ -85,7 +85,7 @@ def test_counts_are_those_of_a_count_by_hand(near: WorldBatch):
     assert np.any(wanted > 0) and np.any(wanted < 0)
 
 
-def test_counts_stand_in_their_cells(near: WorldBatch):
+def test_counts_are_written_into_their_regions(near: WorldBatch):
     counts, q = net_counts(near), SENSOR_WORLD.sectors
     written = {}
     for text in diagram_3_1(SENSOR_WORLD).axes[1].texts:
@@ -96,7 +96,7 @@ def test_counts_stand_in_their_cells(near: WorldBatch):
     assert written == {(ring, sector): counts[ring, sector] for ring in range(2) for sector in range(q)}
 
 
-def test_counts_apart_stand_side_by_side(near: WorldBatch):
+def test_separate_counts_are_written_side_by_side(near: WorldBatch):
     world = dataclasses.replace(SENSOR_WORLD, sensor_counts="separate")
     worlds = best_scene(world, EPISODE_SEED, robots_near)
     own, others = perceived(worlds)
@@ -106,7 +106,7 @@ def test_counts_apart_stand_side_by_side(near: WorldBatch):
     assert texts == wanted
 
 
-def test_heading_points_into_the_fullest_sector(near: WorldBatch):
+def test_the_heading_points_into_the_sector_of_the_highest_count(near: WorldBatch):
     best = int(np.argmax(net_counts(near).sum(axis=0)))
     middle = -math.pi + (best + 0.5) * 2 * math.pi / SENSOR_WORLD.sectors
     (tip,) = arrow_tips(diagram_3_1(SENSOR_WORLD), axes=1)
@@ -114,7 +114,7 @@ def test_heading_points_into_the_fullest_sector(near: WorldBatch):
     assert f"heading {best}" in diagram_3_1(SENSOR_WORLD).axes[1].get_title(loc="left")
 
 
-def test_sectors_that_face_the_goal_are_drawn_so():
+def test_sectors_that_face_the_goal_are_drawn_rotated():
     world = dataclasses.replace(SENSOR_WORLD, sector_frame="goal")
     worlds = best_scene(world, EPISODE_SEED, robots_near)
     state, learner = worlds.state, int(worlds.state.learner[0])
@@ -161,7 +161,7 @@ def test_ellipses_are_numpys_confidence_regions(panel: int, covariance: str):
         assert abs(along @ [math.cos(turn), math.sin(turn)]) == pytest.approx(1.0, abs=1e-4)
 
 
-def test_field_is_minus_the_gradient_of_the_potential(pushed: WorldBatch):
+def test_the_field_is_the_negative_gradient_of_the_potential(pushed: WorldBatch):
     offsets, _, _ = seen_by_hand(pushed)
     config = pushed.config
 
@@ -172,10 +172,10 @@ def test_field_is_minus_the_gradient_of_the_potential(pushed: WorldBatch):
     step = 1e-5
     slopes = [(potential(step * axis) - potential(-step * axis)) / (2 * step) for axis in np.eye(2)]
     assert potential_field(pushed) == pytest.approx(-np.array(slopes), abs=1e-3)
-    assert np.hypot(*slopes) > 0.2, "a field that can be seen"
+    assert np.hypot(*slopes) > 0.2, "the field is large enough to be seen"
 
 
-def test_arrows_are_a_sum(pushed: WorldBatch):
+def test_the_arrows_add_up(pushed: WorldBatch):
     network, field, moved = (np.array(tip) for tip in arrow_tips(diagram_4_3(OUTSIDE_WORLD), axes=0))
     total = network + field
     limit = pushed.config.learner_speed_limit_m_s
@@ -190,13 +190,13 @@ def test_arrows_are_a_sum(pushed: WorldBatch):
 
 
 @pytest.mark.parametrize("diagram", DIAGRAMS, ids=lambda diagram: diagram.file)
-def test_files_are_small_and_always_the_same(diagram: Diagram, tmp_path: Path):
+def test_files_are_small_and_reproducible(diagram: Diagram, tmp_path: Path):
     for name in ("first.png", "second.png"):
         save_png(diagram.draw(WorldConfig(method=diagram.method, robots=10, groups=3)), tmp_path / name)
     assert (tmp_path / "first.png").read_bytes() == (tmp_path / "second.png").read_bytes()
     assert (tmp_path / "first.png").stat().st_size <= 60 * 1024
 
 
-def test_an_episode_that_only_gets_worse_gives_its_start():
+def test_an_episode_of_falling_score_gives_its_start():
     worlds = best_scene(WorldConfig(robots=5, groups=2), 3, lambda batch: -float(batch.state.steps[0]))
     assert int(worlds.state.steps[0]) == 0

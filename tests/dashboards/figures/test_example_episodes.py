@@ -1,4 +1,4 @@
-"""Figures 3.2 and 3.3: the drawn episodes end as their words say, and are the first that do."""
+"""Figures 3.2 and 3.3: the drawn episodes are the first with their outcome."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_the_first_episode_with_the_outcome_is_drawn(example: Diagram, end: tupl
     assert any(outcome.name.lower() in text for text in texts) and any(f"`{rule}`" in text for text in texts)
 
 
-def test_where_there_is_none_the_picture_says_so(monkeypatch: pytest.MonkeyPatch):
+def test_a_missing_outcome_is_stated_in_the_picture(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(example_episodes, "SEARCHED", 250)
-    figure = draw_example(Baseline.GREEDY, Outcome.CAPTURED, WorldConfig(robots=5, groups=1))  # nobody else is there
+    figure = draw_example(Baseline.GREEDY, Outcome.CAPTURED, WorldConfig(robots=5, groups=1))  # there is no other group
     assert any("none in 250 episodes" in text.get_text() for text in figure.texts)

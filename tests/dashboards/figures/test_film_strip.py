@@ -24,7 +24,7 @@ def has_colour(image: np.ndarray, colour: str) -> bool:
     return bool((np.abs(image - np.array(to_rgb(colour)) * 255).max(axis=-1) < 6).any())
 
 
-def test_steps_are_even_with_both_ends():
+def test_steps_are_evenly_spaced_with_both_ends():
     assert frame_steps(251, 6).tolist() == [0, 50, 100, 150, 200, 250]
     assert frame_steps(3, 6).tolist() == [0, 1, 2]
     assert frame_steps(1, 6).tolist() == [0]
@@ -45,7 +45,9 @@ def test_each_frame_shows_its_step(episode: Episode, config: WorldConfig, tmp_pa
             assert np.abs(seen - colour_rgb(colour)).max() <= 40, (step, robot, seen)
 
 
-def test_outcome_stands_above_the_last_frame(episode: Episode, failed: Episode, config: WorldConfig, tmp_path: Path):
+def test_the_outcome_is_written_above_the_last_frame(
+    episode: Episode, failed: Episode, config: WorldConfig, tmp_path: Path
+):
     good = draw(episode, config, tmp_path / "good.png")[:HEAD_PX]
     bad = draw(failed, config, tmp_path / "bad.png")[:HEAD_PX]
     last = 5 * (FRAME_PX + GAP_PX)

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from dashboards.figures.learning_curve import FAILURE_STYLES, VALUE, CurvePoint, learning_curve_png
+from dashboards.analysis.failure_styles import FAILURE_STYLES
+from dashboards.analysis.trainings import CurvePoint
+from dashboards.figures.learning_curve import VALUE, learning_curve_png
 
 Colour = str | tuple[float, float, float]
 
@@ -48,28 +50,28 @@ def test_line_rises_with_the_values_and_the_band_surrounds_it(tmp_path: Path):
     assert shaded.min() < line.min() - 10 and shaded.max() > line.max() + 10
 
 
-def test_share_axis_is_fixed_and_a_return_fills_its_own(tmp_path: Path):
+def test_the_axis_of_shares_is_fixed_and_that_of_returns_fits_the_data(tmp_path: Path):
     low = [row._replace(value=0.1 * row.value, low=0.0, high=0.1) for row in rising(None)]
     as_share = draw(tmp_path / "share.png", low)
     as_return = draw(tmp_path / "return.png", low, value_label="mean return", is_share=False)
     assert height_at(as_share, VALUE, 0.9) < 0.35 < height_at(as_return, VALUE, 0.9)
 
 
-def test_failures_have_a_panel_with_a_line_each(tmp_path: Path):
+def test_failures_have_a_subplot_with_one_line_each(tmp_path: Path):
     plain = draw(tmp_path / "plain.png", rising(None))
     some = draw(tmp_path / "some.png", rising({"lost": 0.3, "collision": 0.1}))
     assert some.shape[0] > plain.shape[0]
-    for name, (colour, _, _) in FAILURE_STYLES.items():
+    for name, (colour, *_) in FAILURE_STYLES.items():
         if name != "timeout":
             assert (len(places(some, colour)[0]) > 50) == (name in ("lost", "collision")), name
-    lost, collision = (height_at(some, FAILURE_STYLES[name][0], 0.6) for name in ("lost", "collision"))
+    lost, collision = (height_at(some, FAILURE_STYLES[name].colour, 0.6) for name in ("lost", "collision"))
     assert lost > collision + 0.05
 
 
 def test_failures_may_be_missing_from_some_rows(tmp_path: Path):
     rows = rising(None)[:4] + rising({"captured": 0.2, "lost": 0.5})[4:]
     image = draw(tmp_path / "curve.png", rows)
-    _, columns = places(image[image.shape[0] * 2 // 3 :], FAILURE_STYLES["captured"][0])
+    _, columns = places(image[image.shape[0] * 2 // 3 :], FAILURE_STYLES["captured"].colour)
     assert columns.min() > 0.45 * image.shape[1]
 
 
@@ -85,7 +87,7 @@ def test_title_is_plain_text(tmp_path: Path):
     assert (tmp_path / "curve.png").stat().st_size > 10_000
 
 
-def test_leaves_pyplot_alone(tmp_path: Path):
+def test_pyplot_is_not_used(tmp_path: Path):
     from matplotlib import pyplot
 
     learning_curve_png(rising({"lost": 0.2}), tmp_path / "curve.png", "10r×2g")

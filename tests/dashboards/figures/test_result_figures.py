@@ -1,4 +1,4 @@
-"""The result figures, read back from what is drawn and from the files."""
+"""The result figures, read back from their drawings and files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def results() -> Results:
 
 
 def bars(axes: Axes, style: tuple[str, str, str]) -> dict[int, float]:
-    """Height in percent of the bars of a style, by the label under them."""
+    """Heights in percent of the bars of a style, by their label's index."""
     colour, hatch, _ = style
     found = [bar for bar in axes.patches if isinstance(bar, Rectangle) and (bar.get_hatch() or "") == hatch]
     found = [bar for bar in found if np.allclose(bar.get_facecolor()[:3], matplotlib.colors.to_rgb(colour))]
@@ -64,7 +64,7 @@ def test_single_group_figure_has_fixed_beside_extrapolation(results: Results):
     assert [axes.get_title(loc="left")[:3] for axes in (a, b, c, d)] == ["(a)", "(b)", "(c)", "(d)"]
 
 
-def test_printed_numbers_stand_where_the_text_gives_them(results: Results):
+def test_printed_numbers_are_marked_at_their_setups(results: Results):
     a, b, c, d = figure_3_4(results).axes
     assert diamonds(a) == [(0, 1.0)] and diamonds(c) == [(0, 1.0), (4, 0.5)] and diamonds(d) == []
     assert diamonds(b) == [(place, 0.85) for place in range(4)]
@@ -82,7 +82,7 @@ def test_several_group_figures_start_at_the_setup_of_the_training(results: Resul
     assert bars(more_groups[2], TRANSFER_STYLE) == {0: 92, 1: 92, 2: 89, 3: 81}
 
 
-def test_methods_figure_has_a_chart_a_robot_count(results: Results):
+def test_the_methods_figure_has_one_chart_per_robot_count(results: Results):
     *charts, key = figure_4_4(results).axes
     assert len(charts) == 5 and key.get_legend() is not None
     for axes, robots in zip(charts, ROBOTS, strict=True):
@@ -91,7 +91,7 @@ def test_methods_figure_has_a_chart_a_robot_count(results: Results):
         assert bars(axes, method_style("in")[:3]) == dict.fromkeys(range(5), IN_SUCCESS)
 
 
-def test_no_series_is_told_by_its_colour_alone():
+def test_series_differ_in_more_than_colour():
     assert len({style.hatch for style in STYLES}) == len(STYLES)
     assert FIXED_STYLE[1] != TRANSFER_STYLE[1]
 
@@ -123,7 +123,7 @@ def test_two_methods_captured_is_left_and_lost_is_right(results: Results):
 
 
 @pytest.mark.parametrize("lost", [0.4, 6.0, 11.0, 19.0, 43.0, 100.0])
-def test_ticks_of_failures_stand_where_they_say(lost: float):
+def test_ticks_of_failures_are_at_whole_percents(lost: float):
     rows = [fixed("sensor", setup, success=0, captured=0, lost=lost) for setup in SETUPS]
     axes = figure_3_7(Results(rows)).axes[0]
     axes.figure.canvas.draw()
@@ -156,13 +156,13 @@ def seeds_drawn(figure: Figure) -> int:
     return sum(line.get_marker() == "o" and len(line.get_xdata()) == 2 for line in figure.axes[0].lines)
 
 
-def test_seeds_are_shown_where_there_are_several(results: Results):
+def test_the_range_over_seeds_is_shown_if_there_are_several(results: Results):
     other = Results([*claimed_table(), fixed("sensor", Setup(10, 1), success=60)._replace(seed=1)])
     assert (seeds_drawn(figure_3_4(results)), seeds_drawn(figure_3_4(other))) == (0, 1)
 
 
 @pytest.mark.parametrize("picture", PICTURES, ids=lambda picture: picture.file)
-def test_files_are_small_and_always_the_same(picture: Picture, results: Results, tmp_path: Path):
+def test_files_are_small_and_reproducible(picture: Picture, results: Results, tmp_path: Path):
     first, second = tmp_path / "first.png", tmp_path / "second.png"
     for path in (first, second):
         save_png(picture.draw(results), path)
@@ -173,14 +173,14 @@ def test_files_are_small_and_always_the_same(picture: Picture, results: Results,
 
 
 @pytest.mark.parametrize("picture", PICTURES, ids=lambda picture: picture.file)
-def test_nothing_to_draw_is_said(picture: Picture, tmp_path: Path):
+def test_missing_data_are_stated_in_the_picture(picture: Picture, tmp_path: Path):
     figure: Figure = picture.draw(Results([]))
     save_png(figure, tmp_path / "empty.png")
     texts = [text.get_text() for axes in figure.axes for text in axes.texts]
     assert "no data" in texts or texts.count("–") == 3 * len(SETUPS)
 
 
-def test_few_colours_keep_the_pictures_colours(results: Results, tmp_path: Path):
+def test_the_reduced_palette_keeps_the_colours(results: Results, tmp_path: Path):
     save_png(figure_4_4(results), tmp_path / "few.png")
     image = matplotlib.image.imread(tmp_path / "few.png")[..., :3]
     for colour, *_ in STYLES[:3]:
@@ -192,7 +192,7 @@ def test_titles_are_plain_text(tmp_path: Path):
     save_png(new_figure(2.0, 1.0, r"$\frac{1$"), tmp_path / "title.png")
 
 
-def test_leaves_pyplot_alone(results: Results):
+def test_pyplot_is_not_used(results: Results):
     from matplotlib import pyplot
 
     figure_3_7(results)

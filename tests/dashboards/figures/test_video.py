@@ -1,4 +1,4 @@
-"""Films against the frames they were made of, decoded by FFmpeg."""
+"""Videos, decoded by FFmpeg and compared with their frames."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sim_core.render import GROUP_COLOURS, colour_rgb, to_pixels
 
 
 def decode(path: Path) -> tuple[np.ndarray, str]:
-    """Frames `[num_frames, height, width, 3]` and FFmpeg's description of the film."""
+    """Frames `[num_frames, height, width, 3]` and FFmpeg's description of the video."""
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     done = subprocess.run(command, capture_output=True, check=True)
     description = done.stderr.decode().split("Output #0")[0]
@@ -31,7 +31,9 @@ def flat(red: int, green: int, blue: int, height: int = 64, width: int = 96) -> 
     return np.full((height, width, 3), (red, green, blue), np.uint8)
 
 
-def test_film_shows_every_state_with_every_robot_in_its_colour(episode: Episode, config: WorldConfig, tmp_path: Path):
+def test_the_video_shows_every_state_with_every_robot_in_its_colour(
+    episode: Episode, config: WorldConfig, tmp_path: Path
+):
     short = episode._replace(position=episode.position[:40])
     write_mp4(episode_frames(short, config, 640), tmp_path / "film.mp4", 20.0)
     frames, description = decode(tmp_path / "film.mp4")
@@ -48,14 +50,14 @@ def test_film_shows_every_state_with_every_robot_in_its_colour(episode: Episode,
             assert nearest == expected, (step, robot, seen)
 
 
-def test_colours_and_order_survive(tmp_path: Path):
+def test_colours_and_order_are_kept(tmp_path: Path):
     colours = [(200, 30, 40), (20, 160, 60), (30, 60, 190)]
     write_mp4([flat(*colour) for colour in colours], tmp_path / "film.mp4", 10.0)
     frames, _ = decode(tmp_path / "film.mp4")
     np.testing.assert_allclose(frames.mean(axis=(1, 2)), colours, atol=8)
 
 
-def test_odd_edges_are_made_even_without_scaling(tmp_path: Path):
+def test_odd_edges_are_padded_without_scaling(tmp_path: Path):
     image = flat(255, 255, 255, 63, 95)
     image[:, :40] = (0, 0, 0)
     write_mp4([image] * 3, tmp_path / "film.mp4", 10.0)
@@ -66,7 +68,7 @@ def test_odd_edges_are_made_even_without_scaling(tmp_path: Path):
     assert frames[1, 63, 95].min() > 230
 
 
-def test_failing_source_leaves_the_older_film(tmp_path: Path):
+def test_a_failing_source_leaves_the_older_video(tmp_path: Path):
     def broken() -> Iterator[np.ndarray]:
         yield flat(1, 2, 3)
         raise RuntimeError("the source broke")

@@ -1,4 +1,4 @@
-"""The player: its payload against the episode, its text against injection, its behaviour in Chromium."""
+"""The player: its data against the episode, its escaping, and its behaviour in Chromium."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def decoded_positions(data: dict[str, Any], shape: tuple[int, ...]) -> np.ndarra
     return ((units + 2**15) % 2**16 - 2**15) * data["metres_per_unit"]
 
 
-def test_positions_come_back_within_the_quantisation(episode: Episode, config: WorldConfig):
+def test_positions_are_decoded_within_the_quantisation(episode: Episode, config: WorldConfig):
     data = payload(player_html(episode, config, "title"))
     metres = decoded_positions(data, episode.position.shape)
     np.testing.assert_allclose(metres, episode.position, atol=0.51 * data["metres_per_unit"])
@@ -52,15 +52,15 @@ def test_positions_come_back_within_the_quantisation(episode: Episode, config: W
     np.testing.assert_allclose(data["goals"], episode.goal, atol=1e-4)
 
 
-def test_velocities_are_the_steps_between_positions(episode: Episode, config: WorldConfig):
-    """The player derives them, so what was recorded must agree."""
+def test_velocities_are_the_differences_of_positions(episode: Episode, config: WorldConfig):
+    """The player computes velocities from positions, so the recorded ones must agree."""
     data = player_data(episode, config)
     metres = decoded_positions(data, episode.position.shape)
     derived = np.diff(metres, axis=0) / config.time_step_s
     np.testing.assert_allclose(derived, episode.velocity[1:], atol=1.1 * data["metres_per_unit"] / config.time_step_s)
 
 
-def test_robots_far_outside_are_not_wrapped(episode: Episode, config: WorldConfig):
+def test_positions_far_outside_do_not_wrap_around(episode: Episode, config: WorldConfig):
     far = episode.position.copy()
     far[-1, 0] = [300.0, -250.0]
     data = player_data(episode._replace(position=far), config)
@@ -68,7 +68,7 @@ def test_robots_far_outside_are_not_wrapped(episode: Episode, config: WorldConfi
     np.testing.assert_allclose(metres[-1, 0], [300.0, -250.0], atol=0.01)
 
 
-def test_who_drives_the_learning_robot(episode: Episode, failed: Episode, config: WorldConfig):
+def test_the_data_state_who_drives_the_learning_robot(episode: Episode, failed: Episode, config: WorldConfig):
     assert player_data(episode, config)["piloted"] is False
     assert player_data(failed, config)["piloted"] is True
 
@@ -90,7 +90,7 @@ def test_three_hundred_steps_of_twenty_robots_are_small(config: WorldConfig):
     assert len(player_html(noise, big, "title").encode()) < 100 * 1024
 
 
-def test_document_names_no_other_document(episode: Episode, config: WorldConfig):
+def test_the_document_links_to_nothing(episode: Episode, config: WorldConfig):
     document = player_html(episode, config, "title")
     links = set(re.findall(r"https?://[^\"' ]+", document))
     assert links == {"http://www.w3.org/2000/svg"}
@@ -106,7 +106,7 @@ def test_outcome_is_stated(episode: Episode, config: WorldConfig, outcome: Outco
     assert payload(document)["outcome"] == OUTCOME_NAMES[outcome]
 
 
-def test_title_is_only_text(episode: Episode, config: WorldConfig):
+def test_the_title_is_escaped(episode: Episode, config: WorldConfig):
     document = player_html(episode, config, EVIL)
     assert "<img" not in document
     assert document.count("</script>") == 2
@@ -148,7 +148,7 @@ def canvas_pixel(page: Any, point_m: np.ndarray, config: WorldConfig) -> np.ndar
     return np.array(page.execute_script(script, column, row)[:3])
 
 
-def test_chromium_keys_move_in_time(page: Any, failed: Episode):
+def test_chromium_keys_move_between_steps(page: Any, failed: Episode):
     from selenium.webdriver.common.keys import Keys
 
     last = len(failed.action) - 1

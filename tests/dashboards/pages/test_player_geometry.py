@@ -1,4 +1,4 @@
-"""What the player computes itself, in Chromium: ellipses against the simulator, ORCA's lines against RVO2."""
+"""Geometry that the player computes, in Chromium: ellipses against the simulator, ORCA's lines against RVO2."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def page(browser: Any, episode: Episode, tmp_path: Path) -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("settings", [{}, {"ellipse_covariance": "full"}, {"ellipse_counts_learner": True}])
-def test_ellipses_are_those_of_the_state(browser: Any, episode: Episode, tmp_path: Path, settings: dict[str, Any]):
+def test_ellipses_are_those_of_the_simulator(browser: Any, episode: Episode, tmp_path: Path, settings: dict[str, Any]):
     config = WorldConfig(robots=4, groups=3, method="out", **settings)
     params = ellipse_params(config)
     page = opened(browser, episode, config, tmp_path)
@@ -56,10 +56,10 @@ def test_ellipses_are_those_of_the_state(browser: Any, episode: Episode, tmp_pat
             minor, major, x, y, turn = group_ellipse(group * 4, (group + 1) * 4, pos_x, pos_y, left_out, params)
             seen = [drawn[name] for name in ("minor", "major", "x", "y")]
             np.testing.assert_allclose(seen, [minor, major, x, y], atol=0.002)
-            assert abs(np.sin(drawn["turn"] - turn)) < 0.02  # half a turn more is the same ellipse
+            assert abs(np.sin(drawn["turn"] - turn)) < 0.02  # an ellipse rotated by half a turn is the same
 
 
-def test_the_heading_drawn_is_the_one_driven(page: Any, episode: Episode):
+def test_the_drawn_heading_is_the_executed_one(page: Any, episode: Episode):
     headings = heading_velocities(OUT, np.float64)
     for action in range(OUT.sectors):
         turn = page.execute_script("return headingOf(arguments[0])", action)
@@ -67,7 +67,7 @@ def test_the_heading_drawn_is_the_one_driven(page: Any, episode: Episode):
     assert page.execute_script("return actions[5]") == episode.action[5]
 
 
-def test_sectors_that_face_the_goal_are_drawn_so(page: Any, episode: Episode):
+def test_sectors_that_face_the_goal_are_drawn_rotated(page: Any, episode: Episode):
     step = STEPS[1]
     page.execute_script("data.sectors_face_goal = true; seek(arguments[0])", step)
     towards = episode.goal[episode.learner // OUT.robots] - episode.position[step, episode.learner]
@@ -78,11 +78,11 @@ def test_sectors_that_face_the_goal_are_drawn_so(page: Any, episode: Episode):
     page.execute_script("data.sectors_face_goal = false")
 
 
-def test_orca_lines_are_rvo2s(page: Any, episode: Episode):
-    known = np.delete(np.arange(OUT.num_robots), episode.learner)  # M_OUT: nobody sees the learning robot
+def test_orca_lines_equal_rvo2s(page: Any, episode: Episode):
+    known = np.delete(np.arange(OUT.num_robots), episode.learner)  # M_OUT: the swarm does not know the learning robot
     compared = 0
     for step in STEPS:
-        # The player's own velocities, which are rounded: RVO2 is to judge the lines made of them.
+        # RVO2 gets the player's own velocities, which are rounded.
         script = """const [step, robots] = arguments;
             const rows = read => robots.map(i => [0, 1].map(axis => read(step, i, axis)));
             return [rows(coordinate), rows(velocityAt)]"""
@@ -94,13 +94,13 @@ def test_orca_lines_are_rvo2s(page: Any, episode: Episode):
             script = "return halfPlanes(...arguments).map(p => [p.x, p.y, p.dx, p.dy])"
             lines = np.array(page.execute_script(script, robot, step)).reshape(-1, 4)
             assert len(lines) == len(theirs)
-            for line in lines:  # equally far neighbours come in another order there
+            for line in lines:  # RVO2 orders neighbours at equal distance differently
                 assert np.abs(theirs - line).max(axis=1).min() < 1e-3
             compared += len(lines)
     assert compared > 30
 
 
-def test_the_next_velocity_lies_in_what_is_permitted(page: Any, episode: Episode):
+def test_the_next_velocity_is_permitted(page: Any, episode: Episode):
     checked = 0
     for step in STEPS:
         for robot in np.delete(np.arange(OUT.num_robots), episode.learner).tolist():
@@ -132,4 +132,4 @@ def test_a_click_on_a_robot_shows_its_lines(page: Any, episode: Episode):
     page.execute_script(
         "element('robot').value = arguments[0]; element('robot').dispatchEvent(new Event('input'))", episode.learner + 1
     )
-    assert "obeys its policy" in page.execute_script("return element('planes-text').textContent")
+    assert "follows its policy" in page.execute_script("return element('planes-text').textContent")

@@ -1,4 +1,4 @@
-"""The HTML report in Chromium: what is drawn against the data, by mouse and by keyboard, in both schemes, alone."""
+"""The HTML report in Chromium: drawn data, mouse, keyboard, colour schemes, and isolation from the network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dashboards.analysis.aggregate import GROUPS, ROBOTS, Results, Setup
 from dashboards.analysis.claims import judge
 from dashboards.analysis.methods import DISSERTATION, method_label
 from dashboards.pages.player import player_data
-from dashboards.pages.report_page import Contents, EpisodeGroup, TablePart, report_data, report_page
+from dashboards.pages.report_page import EpisodeGroup, ReportContents, TableSection, report_data, report_page
 from dashboards.plotly_charts.result_charts import failure_causes, heatmaps, transfers
 from dashboards.plotly_charts.run_charts import setup_curves, sweep_speeds
 from sim_core.config import WorldConfig
@@ -34,17 +34,17 @@ GROUPS_OF = [
 ]
 
 
-def contents() -> Contents:
+def contents() -> ReportContents:
     presets = {"thesis": RESULTS}
     charts = [heatmaps(presets), transfers(presets), failure_causes(presets)]
-    return Contents(
+    return ReportContents(
         title=EVIL,
         subtitle="made up",
         made="by a test",
         facts=[("cells", "75 of 75")],
         charts=[*charts, setup_curves(TRAININGS), sweep_speeds(TRAININGS)],
         claims={"thesis": CLAIMS},
-        tables=[TablePart("running", "Cells under way", "", setup_curves(TRAININGS).views["5r×1g"].table)],
+        tables=[TableSection("running", "Unfinished cells", "", setup_curves(TRAININGS).views["5r×1g"].table)],
         groups=GROUPS_OF,
         episodes_note="some episodes",
     )
@@ -78,7 +78,7 @@ def ready(browser: Any) -> None:
 
 
 def requested(browser: Any) -> set[str]:
-    """Addresses that the page asked for, those that carry their content in themselves left out."""
+    """Addresses that the page has requested, except data and blob URLs."""
     messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     sent = [m["params"] for m in messages if m["method"] == "Network.requestWillBeSent"]
     urls = [params["request"]["url"] for params in sent if params["documentURL"].startswith(("file:", "http:"))]
@@ -102,19 +102,19 @@ def choose(page: Any, section: str, label: str, value: str) -> None:
     two_frames(page)
 
 
-def test_the_page_is_one_file_of_little_more_than_its_library(path: Path):
+def test_the_page_is_one_file_hardly_larger_than_its_library(path: Path):
     assert path.stat().st_size < 2_600_000
     assert "connect-src" not in path.read_text("utf-8").split("</head>")[0]
 
 
-def test_title_is_text(page: Any):
+def test_the_title_is_escaped(page: Any):
     assert page.title == EVIL and page.find_element("tag name", "h1").text == EVIL
-    assert page.execute_script("return document.querySelectorAll('b').length") == 1  # the claims' own
+    assert page.execute_script("return document.querySelectorAll('b').length") == 1  # that of the claims
     ids = page.execute_script("return [...document.querySelectorAll('body [id]')].map(node => node.id)")
     assert len(ids) == len(set(ids)) > 30
 
 
-def test_maps_draw_every_cell(page: Any):
+def test_heat_maps_draw_every_cell(page: Any):
     drawn = plots(page, "success")
     assert [plot["title"] for plot in drawn] == [method_label(method) for method in DISSERTATION]
     for plot, method in zip(drawn, DISSERTATION, strict=True):
@@ -130,7 +130,7 @@ def counted_here(method: str, setup: Setup) -> float:
     return sum(r.goal for r in cell.rows) / cell.episodes
 
 
-def test_a_click_on_a_cell_shows_it_everywhere(page: Any):
+def test_a_click_on_a_cell_selects_its_setup_everywhere(page: Any):
     from selenium.webdriver.common.action_chains import ActionChains
 
     heat = page.execute_script("return document.querySelectorAll('#success .plot')[2]")
@@ -172,7 +172,7 @@ def test_failures_and_curves_are_drawn(page: Any):
     assert len(plots(page, "throughput")[0]["data"]) == 3
 
 
-def test_claims_are_the_judged_ones(page: Any):
+def test_the_judged_claims_are_shown(page: Any):
     script = """return [...document.querySelectorAll('#claims tr[data-claim]')].map(r => [r.dataset.verdict,
         r.querySelector('.verdict-mark').textContent, r.querySelectorAll('details tbody tr').length])"""
     marks = {"holds": "✓ holds", "does not hold": "✗ does not hold", "undecided": "? undecided"}
@@ -182,7 +182,7 @@ def test_claims_are_the_judged_ones(page: Any):
     assert "5r×1g 60.0 %" in page.find_element("css selector", "#claims tr[data-claim='1']").text
 
 
-def test_numbers_stand_in_tables_too(page: Any):
+def test_numbers_are_shown_in_tables_too(page: Any):
     script = (
         "return [...document.querySelectorAll('#success tbody tr')].map(r => [...r.children].map(c => c.textContent))"
     )
@@ -212,7 +212,7 @@ def test_episodes_are_chosen_by_setup_and_outcome(page: Any, failed: Episode):
     assert page.find_element("id", "player").is_displayed()
 
 
-def test_keys_play_where_the_player_has_the_focus_and_scroll_elsewhere(page: Any):
+def test_keys_control_the_player_in_focus_and_scroll_elsewhere(page: Any):
     from selenium.webdriver.common.keys import Keys
 
     page.execute_script("canvas.focus()")
@@ -228,7 +228,7 @@ def test_keys_play_where_the_player_has_the_focus_and_scroll_elsewhere(page: Any
     assert not page.execute_script("return playing")
 
 
-def test_everything_is_reached_by_tab_and_has_a_name(page: Any):
+def test_every_control_is_reached_by_tab_and_has_a_name(page: Any):
     from selenium.webdriver.common.keys import Keys
 
     unnamed = """const named = e => e.getAttribute('aria-label') || e.labels?.length
@@ -247,7 +247,7 @@ def test_everything_is_reached_by_tab_and_has_a_name(page: Any):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_texts_can_be_read(page: Any, scheme: str):
+def test_texts_have_enough_contrast(page: Any, scheme: str):
     with emulate_scheme(page, scheme):
         two_frames(page)
         page.execute_script("for (const d of document.querySelectorAll('details')) d.open = true")
@@ -260,8 +260,8 @@ def test_texts_can_be_read(page: Any, scheme: str):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_lines_and_bars_stand_out(page: Any, scheme: str):
-    """WCAG 1.4.11: what carries meaning has three times the luminance of the page, or a third of it."""
+def test_lines_and_bars_have_enough_contrast(page: Any, scheme: str):
+    """WCAG 1.4.11: graphical objects have a contrast of at least 3 with the page."""
     with emulate_scheme(page, scheme):
         two_frames(page)
         script = """const style = getComputedStyle(document.documentElement), probe = document.createElement('span');
@@ -301,7 +301,7 @@ def test_it_fits_a_narrow_screen(page: Any):
     assert canvas > 280
 
 
-def test_the_page_cannot_reach_anything(browser: Any, path: Path):
+def test_the_page_cannot_connect_to_anything(browser: Any, path: Path):
     browser.get(path.as_uri())
     ready(browser)
     script = (

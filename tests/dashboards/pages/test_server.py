@@ -1,4 +1,4 @@
-"""The page server over real HTTP: what it answers, to whom, and what it refuses."""
+"""The page server over HTTP: its answers, and the requests that it refuses."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def get(server: PageServer, path: str, **headers: str) -> tuple[int, dict[str, s
     return found
 
 
-def test_text_is_a_page_and_all_else_json(server: PageServer):
+def test_text_is_sent_as_a_page_and_all_else_as_json(server: PageServer):
     status, headers, body = get(server, "/")
     assert (status, body, headers["Content-Type"]) == (200, b"<p>page</p>", "text/html; charset=utf-8")
     assert "connect-src 'self'" in headers["Content-Security-Policy"]
@@ -64,7 +64,7 @@ def test_text_is_a_page_and_all_else_json(server: PageServer):
     assert (status, json.loads(body), headers["Content-Type"]) == (200, {"key": "a/b", "n": "3"}, "application/json")
 
 
-def test_what_has_not_changed_is_not_sent_again(server: PageServer, values: dict[str, int]):
+def test_unchanged_answers_are_not_sent_again(server: PageServer, values: dict[str, int]):
     _, headers, body = get(server, "/data.json")
     tag = headers["ETag"]
     assert json.loads(body) == {"n": 1}
@@ -82,18 +82,18 @@ def test_what_has_not_changed_is_not_sent_again(server: PageServer, values: dict
         ("/broken.json", 409, "the run has no checkpoint yet"),
     ],
 )
-def test_refusals_say_why(server: PageServer, path: str, status: int, reason: str):
+def test_refusals_state_the_reason(server: PageServer, path: str, status: int, reason: str):
     found = get(server, path)
     assert (found[0], json.loads(found[2])) == (status, {"error": reason})
 
 
 def test_another_hosts_name_is_refused(server: PageServer):
-    """Else a page from elsewhere could point its own name at this machine and read the answers."""
+    """Otherwise a foreign page could point its own host name at this machine and read the answers."""
     assert get(server, "/data.json", Host="example.org:80")[0] == 403
     assert get(server, "/data.json", Host="localhost:1")[0] == 200
 
 
-def test_only_this_machine_is_served(server: PageServer):
+def test_only_this_machine_can_connect(server: PageServer):
     port = int(server.url.rsplit(":", 1)[1].strip("/"))
     cards = psutil.net_if_addrs().values()
     own = {place.address for places in cards for place in places if place.family == socket.AF_INET}

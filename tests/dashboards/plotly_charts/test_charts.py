@@ -1,4 +1,4 @@
-"""The report's figures as data: against the table they come from, Plotly's own schema, and the page's colours."""
+"""The data of the report's charts, against the table of results, Plotly's schema, and the page's colours."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from plotly.colors import sample_colorscale
 from actors.evaluation.result_table import ResultRow
 from dashboards.analysis.aggregate import GROUPS, ROBOTS, Results, Setup
 from dashboards.analysis.methods import DISSERTATION, method_label
-from dashboards.figures.learning_curve import CurvePoint
+from dashboards.analysis.trainings import CurvePoint, Speed, Training
 from dashboards.pages.assets import asset
 from dashboards.plotly_charts.chart import Chart
 from dashboards.plotly_charts.result_charts import failure_causes, heatmaps, transfers
-from dashboards.plotly_charts.run_charts import Speed, Training, run_curves, run_speeds, setup_curves, sweep_speeds
+from dashboards.plotly_charts.run_charts import run_curves, run_speeds, setup_curves, sweep_speeds
 from tests.dashboards.tables import claimed_table, row
 
 ROWS = claimed_table(without=[row("out", Setup(15, 8), success=0)])
@@ -62,7 +62,7 @@ def with_plain_colours(value: Any) -> Any:
 
 @pytest.mark.parametrize("chart", CHARTS, ids=lambda chart: chart.title)
 def test_plotly_knows_every_property(chart: Chart):
-    """`go.Figure` refuses what Plotly's schema does not have."""
+    """`go.Figure` refuses properties that Plotly's schema does not have."""
     figures = [panel.figure for view in chart.views.values() for panel in view.panels]
     assert figures
     for figure in figures:
@@ -71,14 +71,14 @@ def test_plotly_knows_every_property(chart: Chart):
         go.Figure({"data": [{**with_plain_colours(figures[0])["data"][0], "colour": "red"}]})
 
 
-def test_every_colour_is_in_the_light_and_the_dark_page():
+def test_every_colour_is_defined_in_the_light_and_the_dark_scheme():
     used = {text for chart in CHARTS for text in strings(list(chart.views.values())) if text.startswith("--")}
     light, dark = asset("base.css").split("prefers-color-scheme: dark")
     assert used and all(f"{name}:" in light and f"{name}:" in dark for name in used)
 
 
 @pytest.mark.parametrize("chart", CHARTS, ids=lambda chart: chart.title)
-def test_every_choice_has_its_view_and_its_numbers(chart: Chart):
+def test_every_choice_has_a_view_with_numbers(chart: Chart):
     for view in chart.views.values():
         assert view.panels and view.table.rows
         assert {len(line) for line in view.table.rows} == {len(view.table.header)}
@@ -87,7 +87,7 @@ def test_every_choice_has_its_view_and_its_numbers(chart: Chart):
     assert all(choice.default in dict(choice.options) for choice in chart.choices)
 
 
-def test_maps_have_the_tables_rates():
+def test_heat_maps_have_the_rates_of_the_table():
     view = heatmaps(PRESETS).views["thesis"]
     for panel, method in zip(view.panels, DISSERTATION, strict=True):
         heat = panel.figure["data"][0]
@@ -111,7 +111,7 @@ def contrast(one: tuple[float, ...], other: tuple[float, ...]) -> float:
 
 
 @pytest.mark.parametrize("percent", range(0, 101, 5))
-def test_numbers_on_a_map_can_be_read(percent: int):
+def test_numbers_on_a_heat_map_have_enough_contrast(percent: int):
     rows = [row("sensor", Setup(5, 1), success=percent)]
     panel = heatmaps({"thesis": Results(rows)}).views["thesis"].panels[0]
     colour = panel.figure["layout"]["annotations"][0]["font"]["color"]
@@ -132,21 +132,21 @@ def test_extrapolation_stands_beside_fixed():
         assert share == pytest.approx(r.goal / r.episodes)
         assert 0 < down < 0.03 and 0 < up < 0.03
     assert ("10r×8g", "76.0 % (74.4 … 77.5)", "81.0 % (79.6 … 82.4)") in view.table.rows
-    assert "thesis|in|10r×2g" not in chart.views  # no policy of M_IN was played elsewhere
+    assert "thesis|in|10r×2g" not in chart.views  # no policy of M_IN was tested elsewhere
 
 
-def test_failures_and_success_make_one():
+def test_failures_and_success_add_up_to_one():
     for panel, method in zip(failure_causes(PRESETS).views["thesis"].panels, DISSERTATION, strict=True):
         bars = panel.figure["data"]
         assert [bar["name"] for bar in bars] == ["lost", "captured", "collision", "timeout"]
-        assert len({bar["marker"]["pattern"]["shape"] for bar in bars}) == 4  # not told by colour alone
+        assert len({bar["marker"]["pattern"]["shape"] for bar in bars}) == 4  # they differ in more than colour
         for place, (robots, groups) in enumerate(zip(*bars[0]["x"], strict=True)):
             setup = Setup(int(robots.split()[0]), int(groups.removesuffix("g")))
             r = counted(method, setup)
             assert sum(bar["y"][place] for bar in bars) == pytest.approx(1 - r.goal / r.episodes)
 
 
-def test_curves_have_their_intervals_and_a_line_a_seed():
+def test_curves_have_intervals_and_one_line_per_seed():
     figure = setup_curves(TRAININGS).views["5r×1g"].panels[0].figure
     assert [trace["name"] for trace in figure["data"][2::3]] == [
         f"{name} seed {seed}" for name in map(method_label, DISSERTATION) for seed in (0, 1)
@@ -156,14 +156,14 @@ def test_curves_have_their_intervals_and_a_line_a_seed():
     assert high["fill"] == "tonexty" and line["customdata"][0] == "20.0 % (10.0 … 30.0)"
 
 
-def test_a_return_is_no_share():
+def test_a_return_is_not_shown_in_percent():
     view = run_curves(RETURNS).views[""]
     assert len(view.panels) == 1 and view.panels[0].title == "Mean return"
     assert "tickformat" not in view.panels[0].figure["layout"]["yaxis"]
     assert view.table.rows[0][2] == "0.20 (0.10 … 0.30)"
 
 
-def test_nothing_to_draw_is_no_view():
+def test_without_data_there_is_no_view():
     empty = TRAININGS[0]._replace(curve=[], speeds=[])
     charts = [setup_curves([empty]), sweep_speeds([empty]), run_curves(empty), run_speeds(empty)]
     assert all(chart.views == {} for chart in charts)

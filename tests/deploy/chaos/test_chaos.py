@@ -1,4 +1,4 @@
-"""What a chaos run says of its faults: who recovered when."""
+"""Faults of a chaos run, and their recovery times."""
 
 import io
 import subprocess
@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from deploy.chaos.config import write_config
+from deploy.chaos.faults import FULL, KINDS, MLFLOW, FaultKind, InjectedFault, fault_table, with_recovery
 from deploy.chaos.processes import fill_disk
-from deploy.chaos.run import FULL, KINDS, MLFLOW, Injected, Kind, table, with_recovery
 from deploy.cli import main, read_config_file
 from learner.tracking.fault_log import DRIVER, FaultEntry
 
@@ -20,14 +20,14 @@ def entry(time_s, event, part):
 
 
 def fault(what, victim, time_s):
-    return Injected(Kind(what, victim, 1), time_s)
+    return InjectedFault(FaultKind(what, victim, 1), time_s)
 
 
 def recoveries(faults, log):
     return [made.recovery_s for made in with_recovery(faults, log)]
 
 
-def test_a_part_has_recovered_when_one_of_its_kind_works_again():
+def test_a_component_has_recovered_when_one_of_its_kind_works_again():
     log = [
         entry(11.0, "failed", "rollout worker 1"),
         entry(12.5, "mended", "replay shard 0"),
@@ -45,12 +45,12 @@ def test_a_rebuilt_or_resumed_run_has_recovered_from_everything():
     assert recoveries([fault("killed", kind, 25.0) for kind in kinds], log) == [15.0] * 4
 
 
-def test_only_another_driver_ends_the_loss_of_one():
+def test_a_lost_driver_has_recovered_when_the_run_is_resumed():
     log = [entry(20.0, "mended", "learner"), entry(40.0, "resumed", DRIVER)]
     assert recoveries([fault("killed", DRIVER, 15.0)], log) == [25.0]
 
 
-def test_what_never_recovered_has_no_time_and_neither_have_delays():
+def test_unrecovered_faults_and_delays_have_no_recovery_time():
     log = [entry(20.0, "mended", "rollout worker 0")]
     assert recoveries([fault("killed", "rollout worker", 21.0), fault("delayed", "rollout worker", 10.0)], log) == [
         None,
@@ -61,17 +61,17 @@ def test_what_never_recovered_has_no_time_and_neither_have_delays():
 def test_the_table_counts_faults_and_gives_median_and_maximum():
     faults = [fault("killed", "learner", 0.0)._replace(recovery_s=seconds) for seconds in (1.0, 9.0, 2.0)]
     console = Console(width=100, record=True, file=io.StringIO())
-    console.print(table([*faults, fault("delayed", "learner", 0.0)]))
+    console.print(fault_table([*faults, fault("delayed", "learner", 0.0)]))
     rows = [
         [cell.strip() for cell in line.split("│")[1:-1]] for line in console.export_text().splitlines() if "│" in line
     ]
     assert rows == [["learner delayed", "1", "", ""], ["learner killed", "3", "2.0", "9.0"]]
 
 
-def test_every_process_of_a_run_is_among_the_victims():
-    killed = {kind.victim for kind in KINDS if kind.what == "killed"}
+def test_every_kind_of_process_is_a_victim():
+    killed = {kind.victim for kind in KINDS if kind.action == "killed"}
     assert killed == {"rollout worker", "replay shard", "evaluation", "learner", DRIVER, MLFLOW}
-    assert {kind.victim for kind in KINDS if kind.what == FULL} == {"rollout worker", "replay shard", "learner"}
+    assert {kind.victim for kind in KINDS if kind.action == FULL} == {"rollout worker", "replay shard", "learner"}
 
 
 WRITER = """
@@ -85,7 +85,7 @@ for line in sys.stdin:
 """
 
 
-def test_a_process_whose_disk_is_full_gets_errors_until_it_is_not(tmp_path):
+def test_a_process_gets_write_errors_while_its_disk_is_full(tmp_path):
     with subprocess.Popen(
         [sys.executable, "-c", WRITER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as writer:
@@ -102,7 +102,7 @@ def test_a_process_whose_disk_is_full_gets_errors_until_it_is_not(tmp_path):
         assert write("c") == "written"
 
 
-def test_the_run_under_attack_has_two_of_everything_that_can_be_lost(tmp_path):
+def test_the_chaos_run_has_two_of_every_component_that_can_be_lost(tmp_path):
     write_config(tmp_path / "chaos.toml", 5_000)
     config = read_config_file(tmp_path / "chaos.toml")
     assert (config.engine, config.workers, config.replay_shards, config.replay_placement) == ("ray", 2, 2, "actors")
@@ -118,7 +118,7 @@ def test_the_run_under_attack_has_two_of_everything_that_can_be_lost(tmp_path):
         ("--limit-s", "-1"),
     ],
 )
-def test_what_cannot_be_is_refused(capsys, tmp_path, monkeypatch, flag, value):
+def test_impossible_options_are_refused(capsys, tmp_path, monkeypatch, flag, value):
     monkeypatch.chdir(tmp_path)
     assert main(["chaos", flag, value]) == 2
     assert flag in capsys.readouterr().err and not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""`shoal report` from a file to its folder."""
+"""`shoal report`, from tables of results to the folder that it writes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from actors.evaluation.result_table import ResultRow, write_table
 from dashboards.analysis.aggregate import Setup
 from dashboards.figures.result_figures import PICTURES
 from dashboards.report import DRAWINGS
-from deploy.commands.report import report
+from deploy.commands import report
 from deploy.options.results import Report
 from sim_core.checks import ConfigError
 from tests.dashboards.tables import claimed_table, row
@@ -22,7 +22,7 @@ COMMON = {"claims.md", "report.md", *(drawing.file for drawing in DRAWINGS)}
 def made(rows: list[ResultRow], folder: Path, name: str = "out") -> dict[str, bytes]:
     """The files of a report on `rows`, by their path in its folder."""
     write_table(folder / "results.csv", rows)
-    assert report(Report(results=(folder / "results.csv",), out=folder / name)) == 0
+    assert report.run(Report(results=(folder / "results.csv",), out=folder / name)) == 0
     paths = [path for path in (folder / name).rglob("*") if path.is_file()]
     return {path.relative_to(folder / name).as_posix(): path.read_bytes() for path in paths}
 
@@ -50,7 +50,7 @@ def test_one_preset_needs_no_folder_and_replaces_an_older_report(tmp_path: Path,
     assert "thesis: 15 holds" in capsys.readouterr().out
 
 
-def test_presets_have_a_folder_each_and_every_link_leads_somewhere(both: dict[str, bytes]):
+def test_every_preset_has_a_folder_and_every_link_works(both: dict[str, bytes]):
     assert set(both) == COMMON | {f"{name}/{picture.file}" for name in ("thesis", "best") for picture in PICTURES}
     page = both["report.md"].decode()
     assert set(re.findall(r"\]\(([^)]+)\)", page)) == set(both) - {"report.md"}
@@ -73,45 +73,45 @@ def test_the_same_results_give_the_same_bytes(both: dict[str, bytes], tmp_path: 
 def test_refuses_what_cannot_be_reported(rows: list[ResultRow], message: str, tmp_path: Path):
     write_table(tmp_path / "results.csv", rows)
     with pytest.raises(ConfigError, match=re.escape(message)):
-        report(Report(results=(tmp_path / "results.csv",), out=tmp_path / "out"))
+        report.run(Report(results=(tmp_path / "results.csv",), out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
-def test_refuses_a_file_that_is_not_there(tmp_path: Path):
+def test_refuses_a_missing_file(tmp_path: Path):
     with pytest.raises(ConfigError, match="cannot be read"):
-        report(Report(results=(tmp_path / "none.csv",), out=tmp_path / "out"))
+        report.run(Report(results=(tmp_path / "none.csv",), out=tmp_path / "out"))
 
 
-def test_tables_stand_side_by_side(both: dict[str, bytes], tmp_path: Path):
+def test_several_tables_are_shown_side_by_side(both: dict[str, bytes], tmp_path: Path):
     tables = tuple(tmp_path / name for name in ("thesis.csv", "best.csv"))
     for table in tables:
         write_table(table, [line for line in BOTH if line.preset == table.stem])
-    assert report(Report(results=tables, out=tmp_path / "out")) == 0
+    assert report.run(Report(results=tables, out=tmp_path / "out")) == 0
     page = (tmp_path / "out" / "report.md").read_text()
     names = ", ".join(f"`{tmp_path.name}/{table.name}`" for table in tables)
     assert page.replace(names, "`results.csv`") == both["report.md"].decode()
     assert re.search(r"^\| 14 \| .* \| holds \(10 of 10\) \| no data \(1 of 10\) \|$", page, re.MULTILINE)
 
 
-def test_a_policy_in_two_tables_counts_once_and_is_refused_where_they_differ(tmp_path: Path):
+def test_a_policy_in_two_tables_counts_once_and_is_refused_if_they_differ(tmp_path: Path):
     rows = claimed_table()
     write_table(tmp_path / "results.csv", rows)
     write_table(tmp_path / "more.csv", [rows[0], *(line._replace(seed=1) for line in rows[1:])])
     tables = (tmp_path / "results.csv", tmp_path / "more.csv")
-    assert report(Report(results=tables, out=tmp_path / "out")) == 0
+    assert report.run(Report(results=tables, out=tmp_path / "out")) == 0
     assert "| 1 … 2 |" in (tmp_path / "out" / "report.md").read_text()
     write_table(tmp_path / "more.csv", [rows[0]._replace(goal=rows[0].goal - 1, lost=rows[0].lost + 1)])
     with pytest.raises(ConfigError, match="twice"):
-        report(Report(results=tables, out=tmp_path / "out"))
+        report.run(Report(results=tables, out=tmp_path / "out"))
 
 
 @pytest.mark.parametrize("changed", ["sector_frame=goal", "arena_radius_m=2.0", "learning_rate=1e+3", "no=setting"])
-def test_settings_that_do_not_fit_what_is_drawn_leave_the_report_whole(changed: str, tmp_path: Path):
+def test_settings_that_do_not_fit_the_diagrams_leave_the_report_complete(changed: str, tmp_path: Path):
     rows = [line._replace(preset=f"thesis+{changed}") for line in claimed_table()[:3]]
     assert set(made(rows, tmp_path)) == COMMON | {picture.file for picture in PICTURES}
 
 
-def test_a_presets_name_leads_nowhere_else(tmp_path: Path):
+def test_a_presets_name_cannot_leave_the_folder(tmp_path: Path):
     names = ("../elsewhere", "thesis+a=[1, 2]", "thesis")
     made([row("sensor", Setup(5, 1), success=50, preset=name) for name in names], tmp_path, "deep/out")
     assert {path.name for path in tmp_path.iterdir()} == {"results.csv", "deep"}
@@ -125,4 +125,4 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path, out: str):
     write_table(tmp_path / "results.csv", [row("sensor", Setup(5, 1), success=50)])
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="--out"):
-        report(Report(results=(tmp_path / "results.csv",), out=tmp_path / out))
+        report.run(Report(results=(tmp_path / "results.csv",), out=tmp_path / out))

@@ -1,11 +1,11 @@
-"""What a person sees while a run trains."""
+"""The displays of a running training."""
 
 import io
 
 import pytest
 from rich.console import Console
 
-from deploy.console import training_display as progress
+from deploy.console import training_display
 from deploy.console.training_display import LatestMetrics, LiveDisplay, PlainDisplay, make_display
 from learner.tracking.journal import Row
 
@@ -23,9 +23,9 @@ def lines(console):
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that stands still until it is moved."""
+    """A clock that the test moves."""
     now = [1000.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(training_display.time, "monotonic", lambda: now[0])
     return now
 
 
@@ -49,7 +49,7 @@ def test_the_newest_metrics_in_a_line(metrics, text):
     assert latest.text() == f"{text}  12,346 env steps/s  79 updates/s"
 
 
-def test_a_row_does_not_forget_what_it_did_not_measure():
+def test_metrics_missing_from_a_row_keep_their_values():
     latest = LatestMetrics()
     latest.update(Row(1, 0, {"eval/success_rate": 0.5}))
     latest.update(Row(2, 0, {"speed/updates_per_s": 3.0}))
@@ -66,7 +66,7 @@ def test_plain_lines_come_at_most_every_5_seconds(clock):
     assert [line.split()[0] for line in lines(console)] == ["0", "50", "100", "150"]
 
 
-def test_a_plain_line_says_where_the_run_stands(clock):
+def test_a_plain_line_shows_progress_metrics_and_time_left(clock):
     console = make_console()
     display = PlainDisplay(console, 100_000)
     display.row(row(10_000, train__success_rate=0.25))
@@ -74,7 +74,7 @@ def test_a_plain_line_says_where_the_run_stands(clock):
     display.row(row(30_000))
     first, second = lines(console)
     assert first == "10,000 env steps (10%)  train success 25%  12,346 env steps/s  79 updates/s"
-    # 20,000 env steps took 10 s, 70,000 are left; a resumed run must not count those of before.
+    # 20,000 env steps took 10 s and 70,000 are left. The 10,000 before the first row do not count, as in a resumed run.
     assert second == "30,000 env steps (30%)  train success 25%  12,346 env steps/s  79 updates/s  35 s left"
 
 
@@ -95,7 +95,7 @@ def test_the_first_row_of_a_freshly_started_machine_is_shown(clock):
     assert len(lines(console)) == 1
 
 
-def test_messages_are_not_held_back_or_broken(clock):
+def test_messages_are_printed_at_once_and_unwrapped(clock):
     console = make_console()
     display = PlainDisplay(console, 1000)
     display.row(row(1))
@@ -147,5 +147,5 @@ def test_the_live_display_estimates_the_time_left_and_never_goes_back():
     ("terminal", "term", "kind"),
     [(True, "xterm", LiveDisplay), (True, "dumb", PlainDisplay), (False, "xterm", PlainDisplay)],
 )
-def test_the_console_decides(terminal, term, kind):
+def test_the_console_decides_which_display_is_used(terminal, term, kind):
     assert type(make_display(make_console(terminal, term), 10)) is kind

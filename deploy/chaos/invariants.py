@@ -1,4 +1,4 @@
-"""What must hold after a chaos run: accounts that balance, and every row of metrics in MLflow once."""
+"""What must hold after faults: transition counts balance, and MLflow has every row of metrics exactly once."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from learner.tracking.journal import ACCOUNT, FINAL, Journal, Row, charted
 from learner.tracking.mlflow_history import MetricValue, MlflowHistory
 
 
-def success(folder: RunFolder) -> str:
-    """What the run learned: its success rate at the end with the interval, from MLflow, whose server must run."""
+def final_success(folder: RunFolder) -> str:
+    """The final success rate with its interval, read from MLflow; its server must be running."""
     metrics = MlflowHistory(folder.identity()).newest()
     return as_percent(Estimate(*(metrics[f"{FINAL}success_rate{end}"] for end in ("", "_low", "_high"))))
 
 
-def complaints(folder: RunFolder) -> list[str]:
-    """What is wrong with a run that has ended, a sentence each; nothing if all is well. Its MLflow server must run."""
+def broken_invariants(folder: RunFolder) -> list[str]:
+    """The invariants that a finished run breaks, one sentence each. Its MLflow server must be running."""
     config = folder.config()
     state = resume_point(folder, config)[0].state
     with closing(Journal(folder.journal, state["journal_offset"])) as journal:
@@ -38,17 +38,17 @@ def complaints(folder: RunFolder) -> list[str]:
 
 
 def _unbalanced(rows: list[Row]) -> list[str]:
-    """Rows at which the accounts did not balance."""
-    accounts = [(row.env_steps, row.metrics) for row in rows if f"{ACCOUNT}produced" in row.metrics]
+    """A sentence per row of metrics in which transitions made are not those stored plus those dropped."""
+    counts = [(row.env_steps, row.metrics) for row in rows if f"{ACCOUNT}produced" in row.metrics]
     return [
         f"at {env_steps} env steps the accounts do not balance"
-        for env_steps, metrics in accounts
+        for env_steps, metrics in counts
         if metrics[f"{ACCOUNT}produced"] != metrics[f"{ACCOUNT}stored"] + metrics[f"{ACCOUNT}dropped"]
     ]
 
 
 def _undelivered(folder: RunFolder, rows: list[Row]) -> list[str]:
-    """Metrics whose history in MLflow is not the journal's, in its order."""
+    """A sentence per metric whose history in MLflow differs from the journal's, and one if the run is not FINISHED."""
     history = MlflowHistory(folder.identity())
     wrong = []
     for key in sorted({key for row in rows for key in charted(row.metrics)}):

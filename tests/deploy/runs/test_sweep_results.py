@@ -1,4 +1,4 @@
-"""What a sweep's `settings.json` tells of how its results came about, and what a sweep's folder keeps out."""
+"""The provenance in a sweep's `settings.json`, and results of other settings, which its folder refuses."""
 
 import dataclasses
 import json
@@ -9,9 +9,9 @@ import pytest
 
 from actors.evaluation.result_table import LEARNED, ResultRow, read_table, write_table
 from deploy.cli import parse
-from deploy.commands.sweep import SweepResults
 from deploy.options.training import Sweep
-from deploy.runs.sweep_provenance import read_sittings, sweep_command
+from deploy.runs.sweep_provenance import read_provenance, sweep_command
+from deploy.runs.sweep_results import SweepResults
 from learner.sweep.grid import SweepConfig, cell_hash, make_cells
 from sim_core.checks import ConfigError
 
@@ -27,7 +27,7 @@ def row_of(grid: SweepConfig, episodes: int = 3000) -> ResultRow:
     return ResultRow(grid.label, LEARNED, world.method, *setup, config.seed, *setup, episodes, *counts, 210.0, hashed)
 
 
-def test_the_example_of_a_method_is_a_cell_that_trains(tmp_path: Path):
+def test_the_example_of_each_method_is_a_cell_that_trains(tmp_path: Path):
     SweepResults(GRID, tmp_path).write()
     examples = json.loads((tmp_path / "settings.json").read_text())["a_cell_of_each_method"]
     assert set(examples) == {"sensor", "out"}
@@ -45,50 +45,50 @@ def test_the_example_of_a_method_is_a_cell_that_trains(tmp_path: Path):
         SweepConfig(first_seed=3_000_000_000, extrapolation="none", episodes=600),
     ],
 )
-def test_the_command_of_a_sitting_asks_for_the_same_grid(grid: SweepConfig):
+def test_the_recorded_command_gives_the_same_grid(grid: SweepConfig):
     program, *words = shlex.split(sweep_command(grid))
     command = parse(words)
     assert program == "shoal" and isinstance(command, Sweep) and command.grid == grid
 
 
-def test_sittings_are_kept_and_come_with_known_results(tmp_path: Path):
+def test_provenance_is_kept_and_comes_with_known_results(tmp_path: Path):
     first = SweepResults(GRID, tmp_path / "first")
-    first.begin_sitting()
+    first.record_provenance()
     write_table(first.table, [row_of(GRID)])
-    before = read_sittings(tmp_path / "first" / "results.csv")
-    assert [sitting.command for sitting in before] == [sweep_command(GRID)]
+    before = read_provenance(tmp_path / "first" / "results.csv")
+    assert [each.command for each in before] == [sweep_command(GRID)]
 
     more = SweepConfig(methods=("in",), seeds=(0,))
-    for _ in range(2):  # the same command again, to go on, is the same sitting
+    for _ in range(2):  # the same command again adds no provenance
         later = SweepResults(more, tmp_path / "later", tmp_path / "first" / "results.csv")
-        later.begin_sitting()
+        later.record_provenance()
         later.write()
-    known = read_sittings(tmp_path / "later" / "results.csv")
-    assert [sitting.command for sitting in known] == [sweep_command(GRID), sweep_command(more)]
+    known = read_provenance(tmp_path / "later" / "results.csv")
+    assert [each.command for each in known] == [sweep_command(GRID), sweep_command(more)]
 
 
-def test_the_one_sitting_that_older_files_tell_of_is_kept(tmp_path: Path):
+def test_provenance_of_the_first_format_is_kept(tmp_path: Path):
     older = {"sweep": dataclasses.asdict(GRID), "commit": "a1d63ee"}
     (tmp_path / "settings.json").write_text(json.dumps(older))
     SweepResults(GRID, tmp_path).write()
-    assert read_sittings(tmp_path / "results.csv") == [(sweep_command(GRID), "a1d63ee")]
+    assert read_provenance(tmp_path / "results.csv") == [(sweep_command(GRID), "a1d63ee")]
 
 
-def test_known_results_of_other_settings_are_left_out_and_their_sittings_too(tmp_path: Path):
+def test_known_results_of_other_settings_are_left_out_with_their_provenance(tmp_path: Path):
     other = dataclasses.replace(GRID, env_steps=250_000)
     first = SweepResults(other, tmp_path / "first")
-    first.begin_sitting()
+    first.record_provenance()
     write_table(tmp_path / "first" / "results.csv", [row_of(other)])
     later = SweepResults(GRID, tmp_path / "later", tmp_path / "first" / "results.csv")
     later.write()
     assert later.left_out == 1 and not read_table(tmp_path / "later" / "results.csv")
-    assert read_sittings(tmp_path / "later" / "results.csv") == []
+    assert read_provenance(tmp_path / "later" / "results.csv") == []
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"sittings": [1]}', '{"sittings": {"command": "x"}}'])
-def test_a_file_that_tells_nothing_tells_of_no_sitting(text: str, tmp_path: Path):
+def test_an_unreadable_file_gives_no_provenance(text: str, tmp_path: Path):
     (tmp_path / "settings.json").write_text(text)
-    assert read_sittings(tmp_path / "results.csv") == []
+    assert read_provenance(tmp_path / "results.csv") == []
 
 
 @pytest.mark.parametrize(
@@ -99,8 +99,8 @@ def test_a_file_that_tells_nothing_tells_of_no_sitting(text: str, tmp_path: Path
         {"episodes": 600},
     ],
 )
-def test_a_folder_with_results_of_other_settings_is_left_as_it_is(other: dict[str, int], tmp_path: Path):
-    """Each of these once dropped the table's rows without a word."""
+def test_a_folder_with_results_of_other_settings_is_refused_and_unchanged(other: dict[str, int], tmp_path: Path):
+    """Otherwise each of these would drop rows of the table silently."""
     write_table(tmp_path / "results.csv", [row_of(GRID)])
     before = (tmp_path / "results.csv").read_bytes()
     for robots in ((5, 10), (15,)):  # whether this sweep has the cell or not

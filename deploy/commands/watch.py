@@ -1,0 +1,61 @@
+"""`shoal watch`: one episode of a trained policy as a page, a video or a strip of frames; or a live page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from actors.evaluation.evaluator import record_episode
+from actors.evaluation.trajectory import save_episodes
+from actors.policy.network import WeightsSnapshot
+from dashboards.figures.film_strip import episode_strip_png
+from dashboards.figures.video import check_video_packages
+from deploy.console.serving import serve_until_interrupted
+from deploy.live import live_server
+from deploy.options.results import Watch
+from deploy.runs.artifacts import foreign_animation, write_player, write_video
+from deploy.runs.policy_lookup import find_policy
+from learner.config import RunConfig
+from learner.run_folder import find_run
+from sim_core.checks import require
+from sim_core.outcomes import OUTCOME_NAMES
+
+
+def run(command: Watch) -> int:
+    """Renders an episode, or serves the newest policy's episodes; returns the exit code.
+
+    Raises:
+      ConfigError: there is no such run or policy, its environment cannot be shown in this way, or the port is taken.
+    """
+    folder = find_run(command.run, command.runs_dir)
+    config = folder.config()
+    if command.live:
+        return serve_until_interrupted(live_server(folder, config, command.seed, command.port))
+    if command.format == "mp4":
+        check_video_packages()
+    weights = find_policy(folder, config, command.checkpoint)
+    path = command.out or folder.artifacts / f"episode-{command.seed}.{command.format}"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if config.env.is_swarm:
+        _render_swarm(config, weights, command, folder.artifacts, path)
+    else:
+        require(command.format == "mp4", f"{config.env_id} can only be watched as a video; use --format mp4")
+        made = foreign_animation(config, weights, command.seed, path)
+        require(bool(made), f"{config.env_id} cannot be rendered to images (no rgb_array mode)")
+    Console().print(str(path), highlight=False, soft_wrap=True)
+    return 0
+
+
+def _render_swarm(config: RunConfig, weights: WeightsSnapshot, command: Watch, artifacts: Path, path: Path) -> None:
+    store = artifacts / f"episode-{command.seed}.zarr"
+    store.parent.mkdir(parents=True, exist_ok=True)
+    episode = record_episode(config.env, weights, command.seed)
+    save_episodes(store, [episode], config.world)
+    if command.format == "html":
+        write_player(store, path, f"{config.world.method_name} {config.world.setup}")
+    elif command.format == "mp4":
+        write_video(store, path)
+    else:
+        episode_strip_png(episode, config.world, path)
+    Console().print(f"{len(episode.action) - 1} env steps, outcome {OUTCOME_NAMES[episode.outcome]}", highlight=False)

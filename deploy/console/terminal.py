@@ -1,0 +1,26 @@
+"""What displays of progress share."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+
+
+def is_interactive(console: Console) -> bool:
+    """Whether the console is a terminal in which text can be redrawn in place."""
+    return console.is_terminal and not console.is_dumb_terminal
+
+
+class PlainOutput:
+    """A display that only prints lines: a context manager that sets up nothing."""
+
+    def __enter__(self) -> Self:
+        """Nothing to set up."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing to tear down."""

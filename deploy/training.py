@@ -1,0 +1,79 @@
+"""Trains a run in the foreground: shows its progress, stores its artifacts, and tells how to resume it."""
+
+from __future__ import annotations
+
+import shlex
+import signal
+
+from rich.console import Console
+
+from deploy.console.summary_tables import evaluation_table, summary_lines
+from deploy.console.training_display import make_display
+from deploy.runs.artifacts import log_artifacts
+from learner.checkpoints.checkpoint import Checkpoint
+from learner.config import RunConfig
+from learner.placement import Place
+from learner.run import RunResult, execute
+from learner.run_folder import RunFolder, RunIdentity
+from learner.tracking.journal import Row
+from learner.tracking.mlflow_run import Tracker
+from learner.tracking.redaction import full_uri, public_uri
+from learner.update.learner import learning_device
+
+
+def check_device(config: RunConfig, address: str | None) -> None:
+    """Raises ConfigError if this machine lacks the config's device; a cluster's is checked once Ray has joined it."""
+    if config.engine == "process" or address is None:
+        learning_device(config.device)
+
+
+def open_tracker(identity: RunIdentity) -> Tracker:
+    """The MLflow tracker of a run that exists already."""
+    return Tracker(full_uri(identity.tracking_uri), identity.experiment, None)
+
+
+def print_resume_point(checkpoint: Checkpoint, skipped: list[str]) -> None:
+    """Prints the checkpoint from which a run resumes, and why newer ones were skipped."""
+    for reason in skipped:
+        Console().print(f"skipped: {reason}", markup=False, highlight=False, soft_wrap=True)
+    Console().print(f"going on from {checkpoint.folder}", markup=False, highlight=False, soft_wrap=True)
+
+
+def resume_training(
+    folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, place: Place
+) -> int:
+    """Resumes a run from a checkpoint, or from its start if it has none; returns the exit code."""
+    check_device(config, place.address)
+    tracker.resume(folder.identity().mlflow_run_id)
+    folder.save_config(config)
+    return run_training(folder, config, tracker, checkpoint, place)
+
+
+def run_training(
+    folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, place: Place
+) -> int:
+    """Trains to the end or to a signal; returns the exit code, 128 + the signal's number after one."""
+    console = Console()
+    console.print(f"run {folder.path}", highlight=False, soft_wrap=True)
+    with make_display(console, config.total_env_steps) as display:
+
+        def finish(result: RunResult, rows: list[Row]) -> None:
+            display.message("logging curve, animation and policy")
+            log_artifacts(folder, config, tracker, result, rows, display.message)
+
+        result = execute(folder, config, tracker, display, checkpoint, place, finish)
+    if result.evaluation is None:
+        name = signal.Signals(result.stopped_by).name if result.stopped_by else "a signal"
+        saved = "checkpoint saved" if result.checkpoint else "its checkpoint could not be written"
+        console.print(f"stopped by {name} at {result.env_steps:,} env steps; {saved}", highlight=False)
+        console.print(f"resume with: {resume_command(folder)}", highlight=False, soft_wrap=True)
+        return 128 + (result.stopped_by or 0)
+    console.print(evaluation_table(result.evaluation, config.name))
+    for line in summary_lines(folder, result, public_uri(tracker.uri), config.env.is_swarm):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return 0
+
+
+def resume_command(folder: RunFolder) -> str:
+    """The command that resumes a run, from any working directory."""
+    return f"shoal resume {shlex.quote(str(folder.path))}"
