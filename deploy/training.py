@@ -11,7 +11,7 @@ from deploy.console.summary_tables import evaluation_table, summary_lines
 from deploy.console.training_display import make_display
 from deploy.runs.artifacts import log_artifacts
 from learner.checkpoints.checkpoint import Checkpoint
-from learner.config import RunConfig
+from learner.config import RunConfig, check_files_unchanged
 from learner.placement import Place
 from learner.run import RunResult, execute
 from learner.run_folder import RunFolder, RunIdentity
@@ -42,7 +42,12 @@ def print_resume_point(checkpoint: Checkpoint, skipped: list[str]) -> None:
 def resume_training(
     folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, place: Place
 ) -> int:
-    """Resumes a run from a checkpoint, or from its start if it has none; returns the exit code."""
+    """Resumes a run from a checkpoint, or from its start if it has none; returns the exit code.
+
+    Raises:
+      ConfigError: the config's device is not there, or a user's own method or scene has changed.
+    """
+    check_files_unchanged(config)
     check_device(config, place.address)
     tracker.resume(folder.identity().mlflow_run_id)
     folder.save_config(config)

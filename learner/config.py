@@ -14,7 +14,7 @@ from actors.rollout.vector_env import EnvSpec
 from sim_core import ENV_ID
 from sim_core.checks import ConfigError, check_fields, require
 from sim_core.config import WorldConfig
-from sim_core.plugins import METHODS, SCENES, identity
+from sim_core.plugins import METHODS, SCENES, check_unchanged, identity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,6 +242,22 @@ def flat_params(config: RunConfig) -> dict[str, Any]:
     values = to_dict(config)
     world: dict[str, Any] = values.pop("world")
     return values | world
+
+
+def user_files(config: RunConfig) -> dict[str, str]:
+    """Texts of a user's own files by `SETTING/NAME`, such as `method/my_method.py`."""
+    found = {}
+    for kind in (METHODS, SCENES):
+        name, text = getattr(config.world, kind.setting), getattr(config.world, f"{kind.setting}_source")
+        if text:
+            found[f"{kind.setting}/{identity(kind, name).rpartition(':')[0]}"] = text
+    return found
+
+
+def check_files_unchanged(config: RunConfig) -> None:
+    """Raises ConfigError if a user's own file, where it is still there, is no longer the one that the config holds."""
+    for kind in (METHODS, SCENES):
+        check_unchanged(kind, getattr(config.world, kind.setting), getattr(config.world, f"{kind.setting}_source"))
 
 
 def from_dict(values: dict[str, Any]) -> RunConfig:

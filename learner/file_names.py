@@ -2,6 +2,8 @@
 
 CONFIG = "config.json"
 """In a run's folder: its config."""
+USER_FILES = "user_files"
+"""In a run's folder: copies of a user's own method and scene."""
 IDENTITY = "run.json"
 """In a run's folder: its MLflow identity."""
 STORAGE = "storage.json"

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from actors.storage.uri import Location, parse_location
 from learner import file_names
-from learner.config import RunConfig, from_dict, to_dict
+from learner.config import RunConfig, from_dict, to_dict, user_files
 from sim_core.checks import ConfigError, require
 
 
@@ -70,8 +70,12 @@ class RunFolder:
             yield
 
     def save_config(self, config: RunConfig) -> None:
-        """Writes `config.json`."""
+        """Writes `config.json`, and beside it copies of a user's own files."""
         write_json(self.path / file_names.CONFIG, to_dict(config))
+        for name, text in user_files(config).items():
+            path = self.path / file_names.USER_FILES / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, "utf-8")
 
     def config(self) -> RunConfig:
         """Reads `config.json`.

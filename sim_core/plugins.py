@@ -86,7 +86,7 @@ def read_source(kind: Kind, name: str) -> tuple[str, str]:
     require(cls not in kind.built_in, f"{kind.setting} {name!r}: {cls} is taken; give the class another name")
     path = os.path.abspath(file)
     shipped = json.loads(os.environ.get(SOURCES, "{}"))
-    for key in (file, path):
+    for key in (os.path.normpath(file), path):
         if key in shipped:
             return f"{path}:{cls}", str(shipped[key])
     try:
@@ -94,6 +94,21 @@ def read_source(kind: Kind, name: str) -> tuple[str, str]:
         return f"{path}:{cls}", Path(path).read_text("utf-8-sig")
     except (OSError, ValueError) as error:
         raise ConfigError(f"{kind.setting} {name!r}: {file} cannot be read: {error}") from error
+
+
+def check_unchanged(kind: Kind, name: str, source: str) -> None:
+    """Raises ConfigError if the file that `name` names is there and no longer has the text `source`."""
+    if name in kind.built_in:
+        return
+    try:
+        _, text = read_source(kind, name)
+    except ConfigError:
+        return  # it has gone, and is not needed
+    require(
+        text == source,
+        f"{name.rpartition(':')[0]} has changed since the run began, which holds a copy of it (user_files): put that "
+        "copy in its place, or begin another run",
+    )
 
 
 @functools.lru_cache(maxsize=256)

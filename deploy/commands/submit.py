@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -12,9 +13,11 @@ from deploy.options.training import Launch, Submit, Sweep, Train
 from deploy.ray_jobs import Job, JobResult, JobServer
 from deploy.runs.folders import default_name, default_sweep_name
 from learner.config import config_hash
+from learner.sweep.grid import changed_settings
 from learner.tracking.mlflow_run import COMMIT, git_commit
 from learner.training.stop_signals import StopRequest, stop_on_signals
 from sim_core.checks import require
+from sim_core.plugins import METHODS, SCENES, SOURCES, read_source
 
 TRACKING = "MLFLOW_TRACKING_URI"
 STOPPING = "shoal: stopping the job, which saves a checkpoint first; Ctrl-C again leaves it to itself"
@@ -85,9 +88,26 @@ def _running_or_submitted(server: JobServer, command: Submit, job: Train | Sweep
         return running[-1]
     entrypoint = f"python -m deploy {shlex.join(job_arguments(command.arguments, job))}"
     env = {COMMIT: git_commit()} | {key: os.environ[key] for key in (TRACKING,) if os.environ.get(key)}
+    env |= {SOURCES: json.dumps(_user_files(job))}
     submitted = server.submit(name, entrypoint, working_dir, env, command.stop_wait_s)
     _write(f"shoal: job {submitted.id} on {server.address}\n")
     return submitted
+
+
+def _user_files(job: Train | Sweep) -> dict[str, str]:
+    """Texts of the user's own methods and scenes, by the names under which the job looks for them."""
+    if isinstance(job, Train):
+        names = [(METHODS, job.run.world.method), (SCENES, job.run.world.scene)]
+    else:
+        scene = changed_settings(job.grid.set)[1].get("scene")
+        names = [(METHODS, method) for method in job.grid.methods] + ([(SCENES, scene)] if scene else [])
+    found: dict[str, str] = {}
+    for kind, name in names:
+        absolute, text = read_source(kind, name)
+        if text:
+            path = absolute.rpartition(":")[0]
+            found |= {path: text, os.path.relpath(path): text}
+    return found
 
 
 def _exit_code(result: JobResult, job: Job, stop: StopRequest) -> int:

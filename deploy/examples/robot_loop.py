@@ -29,7 +29,7 @@ def load(folder: Path) -> tuple[Any, dict[str, Any]]:
 
 
 def sense(method: str, robot: Any, groups: Any, goals: Any) -> dict[str, Any]:
-    """The robot's input, a batch of one: positions of all other robots relative to it, in metres, its own group first."""
+    """The robot's input, a batch of one: positions of the other robots relative to it, in metres, own group first."""
     positions = (groups - robot)[None].astype(np.float32)  # [1, groups, robots, 2]
     mask = np.ones(positions.shape[:3], bool)  # False for a robot that is not sensed
     if method != "sensor":

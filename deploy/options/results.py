@@ -89,7 +89,7 @@ class Watch:
     out: Path | None = None
     """File to write; `episode-SEED` in the run's artifacts by default."""
     live: Switch = 0
-    """Serve a page on 127.0.0.1 that follows a running training: it plays episodes of the newest checkpoint's policy."""
+    """Serve a page on 127.0.0.1 that follows a running training and plays the newest checkpoint's policy."""
     port: int = 8400
     """--live: port of the page; 0 takes a free one."""
     checkpoint: str = "newest"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
 import os
@@ -21,7 +22,8 @@ import torch
 from actors.policy.network import QNetwork, WeightsSnapshot, load_snapshot
 from actors.rollout.vector_env import EnvShape
 from actors.service.fault_policy import first_line
-from learner.config import RunConfig, config_hash, flat_params
+from learner.config import RunConfig, config_hash, flat_params, user_files
+from learner.file_names import USER_FILES
 from learner.tracking.journal import FINAL, Row, charted
 from learner.tracking.mlflow_views import TAG, packed_view, sweep_views
 from learner.tracking.redaction import hide_secrets, public_uri
@@ -129,8 +131,10 @@ class Tracker:
 
     def log_inputs(self, config: RunConfig) -> None:
         """Logs the whole config and the episodes it names; what the run has already must be the same."""
-        params = [Param(key, str(value)) for key, value in flat_params(config).items()]
+        params = [Param(key, _param_text(key, value)) for key, value in flat_params(config).items()]
         self._client.log_batch(self.run_id, params=params)
+        for name, text in user_files(config).items():
+            self._client.log_text(self.run_id, text, f"{USER_FILES}/{name}")
         self._client.log_inputs(self.run_id, datasets=dataset_inputs(config, self._commit))
 
     def find_run(self, tags: dict[str, str]) -> str | None:
@@ -241,6 +245,12 @@ class Tracker:
     def end(self, status: str) -> None:
         """Closes the run as FINISHED, KILLED or FAILED."""
         self._client.set_terminated(self.run_id, status)
+
+
+def _param_text(name: str, value: object) -> str:
+    """A param's value; of a user's own file its checksum, since MLflow's params are short."""
+    is_file = name.endswith("_source") and value
+    return f"sha256:{hashlib.sha256(str(value).encode()).hexdigest()[:16]}" if is_file else str(value)
 
 
 COMMIT = "SHOAL_COMMIT"
