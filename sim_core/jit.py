@@ -4,6 +4,7 @@ Numba caches a compiled kernel on disk and compiles it again when the kernel's o
 changes in other files, so a kernel that inlines kernels of another file would keep their old code. The cache folder is
 therefore named after a hash of all sources that can hold kernels: every file of this package and every file of
 `KERNEL_PACKAGES` that imports this module, subfolders included. A change in any of them starts an empty cache folder.
+The sources in `__pycache__` do not count: they are copies of users' own methods and scenes (`sim_core.plugins`).
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ def _cache_folder() -> str:
     digest = hashlib.sha256()
     for folder in (package, *(package.parent / name for name in KERNEL_PACKAGES)):
         for source in sorted(folder.rglob("*.py")):
-            content = source.read_bytes()
-            if folder == package or b"sim_core.jit" in content:
-                digest.update(str(source.relative_to(package.parent)).encode() + b"\0" + content)
+            name, content = source.relative_to(package.parent), source.read_bytes()
+            if "__pycache__" not in name.parts and (folder == package or b"sim_core.jit" in content):
+                digest.update(str(name).encode() + b"\0" + content)
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "shoal"
     beside = package / "__pycache__" if os.access(package, os.W_OK) else user
     base = Path(numba.config.CACHE_DIR) if numba.config.CACHE_DIR else beside

@@ -8,9 +8,8 @@ import pytest
 import deploy
 
 ROOT = Path(deploy.__file__).parent.parent
-SOURCES = [
-    path for name in ("sim_core", "actors", "learner", "dashboards", "deploy") for path in (ROOT / name).rglob("*.py")
-]
+PACKAGES = ("sim_core", "actors", "learner", "dashboards", "deploy")
+SOURCES = [path for name in PACKAGES for path in (ROOT / name).rglob("*.py") if "__pycache__" not in path.parts]
 READERS = {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
 SHELLS = {"os.system", "os.popen", "subprocess.getoutput", "subprocess.getstatusoutput"}
 RUNNERS = {"run", "Popen", "call", "check_call", "check_output"}

@@ -98,8 +98,9 @@ def test_a_changed_kernel_in_a_subfolder_of_any_package_starts_another_cache_fol
 
 
 def test_the_cache_folder_depends_on_every_source_with_kernels(monkeypatch, tmp_path):
-    """Wherever a kernel lies: all sources that decorate a function as a kernel are found by their text."""
+    """The sources are found by the decorators in their text. Users' own methods, like deploy/examples, are plug-ins."""
     copy_packages(tmp_path, "sim_core", "actors", "learner", "deploy", "dashboards")
+    shutil.rmtree(tmp_path / "deploy" / "examples")
     functions = inspect.getmembers(jit, lambda value: inspect.isfunction(value) and value.__module__ == jit.__name__)
     decorators = [name for name, _ in functions if not name.startswith("_")]
     decorated = re.compile(rf"^@({'|'.join(decorators)})$", re.MULTILINE)
@@ -113,6 +114,18 @@ def test_the_cache_folder_depends_on_every_source_with_kernels(monkeypatch, tmp_
         append_a_comment(source)
         folders.add(jit._cache_folder())
         assert len(folders) == count, source
+
+
+def test_plugins_in_the_cache_folder_do_not_change_it(monkeypatch, tmp_path):
+    copy_packages(tmp_path, "sim_core", *jit.KERNEL_PACKAGES)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setattr(jit, "__file__", str(tmp_path / "sim_core" / "jit.py"))
+    folder = Path(jit._cache_folder())
+    assert tmp_path in folder.parents
+    plugin = folder / "plugins" / "0123456789abcdef" / "my_method.py"
+    plugin.parent.mkdir(parents=True)
+    plugin.write_text("from sim_core.jit import kernel\n")
+    assert Path(jit._cache_folder()) == folder
 
 
 def test_other_users_of_numba_keep_their_cache_folder(monkeypatch):
