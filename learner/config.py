@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import os
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -248,7 +249,7 @@ def user_files(config: RunConfig) -> dict[str, str]:
     """Texts of a user's own files by `SETTING/NAME`, such as `method/my_method.py`."""
     found = {}
     for kind in (METHODS, SCENES):
-        name, text = getattr(config.world, kind.setting), getattr(config.world, f"{kind.setting}_source")
+        name, text = getattr(config.world, kind.setting), config.world.source(kind)
         if text:
             found[f"{kind.setting}/{identity(kind, name).rpartition(':')[0]}"] = text
     return found
@@ -257,7 +258,7 @@ def user_files(config: RunConfig) -> dict[str, str]:
 def check_files_unchanged(config: RunConfig) -> None:
     """Raises ConfigError if a user's own file, where it is still there, is no longer the one that the config holds."""
     for kind in (METHODS, SCENES):
-        check_unchanged(kind, getattr(config.world, kind.setting), getattr(config.world, f"{kind.setting}_source"))
+        check_unchanged(kind, getattr(config.world, kind.setting), config.world.source(kind))
 
 
 def from_dict(values: dict[str, Any]) -> RunConfig:
@@ -286,6 +287,7 @@ def identity_dict(config: RunConfig) -> dict[str, Any]:
     values = to_dict(config)
     for kind in (METHODS, SCENES):
         values["world"][kind.setting] = identity(kind, values["world"][kind.setting])
+    values["world"]["sources"] = tuple((os.path.basename(path), text) for path, text in config.world.sources)
     return values
 
 

@@ -56,6 +56,6 @@ def preset_config(name: PresetName, method: str, robots: int = 10, groups: int =
     Raises:
       ConfigError: the method is unknown or the setup is not possible.
     """
-    presets = load(METHODS, *read_source(METHODS, method)).presets or load(METHODS, "sensor", "").presets
+    presets = load(METHODS, method, read_source(METHODS, method)).presets or load(METHODS, "sensor", "").presets
     training, world = presets[name]
     return RunConfig(world=WorldConfig(method=method, robots=robots, groups=groups, **world), **_COMMON, **training)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from sim_core.checks import check_fields, require
-from sim_core.plugins import METHODS, SCENES, Kind, guarded, load, read_source, short_name
+from sim_core.plugins import METHODS, SCENES, Kind, file_of, guarded, load, read_source, short_name
 
 if TYPE_CHECKING:
     from sim_core.methods.base import Method
@@ -148,15 +148,12 @@ class WorldConfig:
     uniform_slow_radius_m: float = 0.25
     """`uniform`: robots slow down within this distance of the goal."""
 
-    method_source: str = ""
-    """Text of the file that `method` names; read when the settings are made, and kept with them."""
-    scene_source: str = ""
-    """Text of the file that `scene` names; read when the settings are made, and kept with them."""
+    sources: tuple[tuple[str, str], ...] = ()
+    """Path and text of each file that `method` or `scene` names; read when the settings are made, not to be given."""
 
     def __post_init__(self) -> None:
         check_fields(self)
-        _take_source(self, METHODS)
-        _take_source(self, SCENES)
+        _take_sources(self)
         _check_counts(self)
         _check_group_sizes(self)
         _check_lengths(self)
@@ -173,15 +170,19 @@ class WorldConfig:
         """Robots of each group, as the scene has them."""
         return tuple(int(size) for size in self.scene_class.group_sizes(self))
 
+    def source(self, kind: Kind) -> str:
+        """The text of the user's own file that a setting names; empty where it names none."""
+        return dict(self.sources).get(file_of(kind, getattr(self, kind.setting)), "")
+
     @property
     def method_class(self) -> type[Method]:
         """The class of `method`."""
-        return load(METHODS, self.method, self.method_source)
+        return load(METHODS, self.method, self.source(METHODS))
 
     @property
     def scene_class(self) -> type[Scene]:
         """The class of `scene`."""
-        return load(SCENES, self.scene, self.scene_source)
+        return load(SCENES, self.scene, self.source(SCENES))
 
     @property
     def method_name(self) -> str:
@@ -217,15 +218,24 @@ class WorldConfig:
         return alike if self.scene in SCENES.built_in else f"{short_name(SCENES, self.scene)} {alike}"
 
 
-def _take_source(config: WorldConfig, kind: Kind) -> None:
-    """Reads the file that a setting names, unless its text is there already."""
-    name, source = getattr(config, kind.setting), getattr(config, f"{kind.setting}_source")
-    if name in kind.built_in or not source:
-        name, text = read_source(kind, name)
-        require(not source, f"{kind.setting}_source must be empty for {kind.setting} {name!r}, which is no file")
-        object.__setattr__(config, kind.setting, name)
-        object.__setattr__(config, f"{kind.setting}_source", text)
-    load(kind, name, getattr(config, f"{kind.setting}_source"))
+def _take_sources(config: WorldConfig) -> None:
+    """Reads the files that settings name, unless their texts are there already; drops texts that none names."""
+    given = tuple(map(tuple, config.sources)) if isinstance(config.sources, tuple | list) else None
+    require(
+        given is not None and all(len(pair) == 2 and all(isinstance(text, str) for text in pair) for pair in given),
+        "sources must be pairs of a path and a text; leave them out, they are read",
+    )
+    known = {path: text for path, text in given or ()}
+    used: dict[str, str] = {}
+    for kind in (METHODS, SCENES):
+        name = getattr(config, kind.setting)
+        path = file_of(kind, name)
+        if path:
+            used[path] = known[path] if path in known else read_source(kind, name)
+            object.__setattr__(config, kind.setting, f"{path}:{short_name(kind, name)}")
+    object.__setattr__(config, "sources", tuple(sorted(used.items())))
+    for kind in (METHODS, SCENES):
+        load(kind, getattr(config, kind.setting), config.source(kind))
 
 
 def _check_group_sizes(config: WorldConfig) -> None:

@@ -1,7 +1,7 @@
 """Methods and scenes by name: those of this package, and a user's own in a Python file.
 
-A user's own is named `FILE.py:CLASS`. The text of the file becomes part of the world's settings (`method_source`,
-`scene_source`), so it goes wherever settings go: to Ray workers, into a run's config, its hash and its checkpoints. A
+A user's own is named `FILE.py:CLASS`. The text of the file becomes part of the world's settings (`sources`), so it
+goes wherever settings go: to Ray workers, into a run's config, its hash and its checkpoints. A
 module made from that text is what runs; the file itself is read once, when the settings are made.
 """
 
@@ -69,14 +69,14 @@ def identity(kind: Kind, name: str) -> str:
     return name if name in kind.built_in else os.path.basename(name)
 
 
-def read_source(kind: Kind, name: str) -> tuple[str, str]:
-    """The name with an absolute path, and the text of the file that it names; `("sensor", "")` of `sensor`.
+def file_of(kind: Kind, name: str) -> str:
+    """The absolute path of the file that `name` names; empty where it is one of this package's.
 
     Raises:
-      ConfigError: the name is none of this package's and names no file, or the file cannot be read.
+      ConfigError: the name is none of this package's and no `FILE.py:CLASS`.
     """
     if name in kind.built_in:
-        return name, ""
+        return ""
     file, _, cls = name.rpartition(":")
     known = ", ".join(kind.built_in)
     require(
@@ -84,14 +84,25 @@ def read_source(kind: Kind, name: str) -> tuple[str, str]:
         f"{kind.setting} must be one of: {known}; or FILE.py:CLASS; not {name!r}",
     )
     require(cls not in kind.built_in, f"{kind.setting} {name!r}: {cls} is taken; give the class another name")
-    path = os.path.abspath(file)
+    return os.path.abspath(file)
+
+
+def read_source(kind: Kind, name: str) -> str:
+    """The text of the file that `name` names; empty where it is one of this package's.
+
+    Raises:
+      ConfigError: see `file_of`; or the file cannot be read.
+    """
+    path, file = file_of(kind, name), name.rpartition(":")[0]
+    if not path:
+        return ""
     shipped = json.loads(os.environ.get(SOURCES, "{}"))
     for key in (os.path.normpath(file), path):
         if key in shipped:
-            return f"{path}:{cls}", str(shipped[key])
+            return str(shipped[key])
     try:
         require(os.path.getsize(path) <= MAX_BYTES, f"{kind.setting} {name!r}: {file} is larger than {MAX_BYTES} bytes")
-        return f"{path}:{cls}", Path(path).read_text("utf-8-sig")
+        return Path(path).read_text("utf-8-sig")
     except (OSError, ValueError) as error:
         raise ConfigError(f"{kind.setting} {name!r}: {file} cannot be read: {error}") from error
 
@@ -101,7 +112,7 @@ def check_unchanged(kind: Kind, name: str, source: str) -> None:
     if name in kind.built_in:
         return
     try:
-        _, text = read_source(kind, name)
+        text = read_source(kind, name)
     except ConfigError:
         return  # it has gone, and is not needed
     require(

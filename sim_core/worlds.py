@@ -154,7 +154,7 @@ def rehearse(config: WorldConfig) -> None:
     Raises:
       PluginError: the user's code raises, or gives what it must not give; the message names its file and line.
     """
-    if not (config.method_source or config.scene_source):
+    if not config.sources:
         return
     worlds = WorldBatch(config, REHEARSAL_WORLDS)
     worlds.reset()

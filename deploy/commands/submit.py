@@ -17,7 +17,7 @@ from learner.sweep.grid import changed_settings
 from learner.tracking.mlflow_run import COMMIT, git_commit
 from learner.training.stop_signals import StopRequest, stop_on_signals
 from sim_core.checks import require
-from sim_core.plugins import METHODS, SCENES, SOURCES, read_source
+from sim_core.plugins import METHODS, SCENES, SOURCES, file_of, read_source
 
 TRACKING = "MLFLOW_TRACKING_URI"
 STOPPING = "shoal: stopping the job, which saves a checkpoint first; Ctrl-C again leaves it to itself"
@@ -103,10 +103,9 @@ def _user_files(job: Train | Sweep) -> dict[str, str]:
         names = [(METHODS, method) for method in job.grid.methods] + ([(SCENES, scene)] if scene else [])
     found: dict[str, str] = {}
     for kind, name in names:
-        absolute, text = read_source(kind, name)
-        if text:
-            path = absolute.rpartition(":")[0]
-            found |= {path: text, os.path.relpath(path): text}
+        path = file_of(kind, name)
+        if path:
+            found[path] = found[os.path.relpath(path)] = read_source(kind, name)
     return found
 
 

@@ -69,7 +69,7 @@ class SweepConfig:
             f"baselines must be among {', '.join(rules)}, not {self.baselines}",
         )
         for method in self.methods:
-            load(METHODS, *read_source(METHODS, method))
+            load(METHODS, method, read_source(METHODS, method))
         names = [short_name(METHODS, method) for method in self.methods]
         require(len(set(names)) == len(names), f"methods must have different names, not {', '.join(names)}")
         for name in ("episodes", "extrapolation_episodes", "baseline_episodes", "env_steps"):
@@ -86,7 +86,7 @@ class SweepConfig:
 
 
 NOT_SET = (
-    "world seed engine device method method_source scene_source robots groups env_id total_env_steps "
+    "world seed engine device method sources robots groups env_id total_env_steps "
     "final_eval_episodes final_eval_first_seed"
 ).split()
 """Settings that the grid itself decides."""

@@ -249,7 +249,7 @@ class Tracker:
 
 def _param_text(name: str, value: object) -> str:
     """A param's value; of a user's own file its checksum, since MLflow's params are short."""
-    is_file = name.endswith("_source") and value
+    is_file = name == "sources" and value
     return f"sha256:{hashlib.sha256(str(value).encode()).hexdigest()[:16]}" if is_file else str(value)
 
 

@@ -74,7 +74,7 @@ def flags(config: RunConfig) -> list[str]:
     default_world = defaults.pop("world")
     for values, default in ((plain, defaults), (world, default_world)):
         for name, value in values.items():
-            if value != default[name]:
+            if value != default[name] and name != "sources":
                 items = value if isinstance(value, tuple) else (value,)
                 result += [f"--{name.replace('_', '-')}", *map(str, items)]
     return result

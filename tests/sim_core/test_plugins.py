@@ -100,7 +100,7 @@ def test_a_file_that_lies_on_no_disk_is_taken_from_the_environment(tmp_path, mon
     text = (tmp_path / "mine.py").read_text()
     (tmp_path / "mine.py").unlink()
     monkeypatch.setenv(SOURCES, json.dumps({str(tmp_path / "mine.py"): text}))
-    assert WorldConfig(method=name).method_source == text
+    assert WorldConfig(method=name).sources == ((str(tmp_path / "mine.py"), text),)
 
 
 def test_gymnasium_takes_them_and_finds_nothing_wrong():
