@@ -17,7 +17,7 @@ from learner.config import RunConfig
 from learner.file_names import CONFIG
 from learner.loop import TrainingLoop
 from learner.placement import Place
-from learner.ray_backend.cluster import ray_cluster
+from learner.ray_backend.cluster import RayCluster
 from learner.ray_backend.metrics import RayMetrics
 from learner.run_folder import RunFolder
 from learner.tracking.delivery import Delivery, insist
@@ -26,7 +26,7 @@ from learner.tracking.journal import Journal, PushedMark, Row
 from learner.tracking.mlflow_run import TROUBLE, Tracker
 from learner.tracking.observer import Display, MirroringObserver
 from learner.tracking.redaction import hide_secrets
-from learner.training.cluster import Cluster, process_cluster
+from learner.training.cluster import Cluster, ProcessCluster
 from learner.training.evaluation_summary import Evaluation, as_metrics, summarise
 from learner.training.recovery import RunLost
 from learner.training.stop_signals import stop_on_signals
@@ -56,8 +56,8 @@ class RunResult(NamedTuple):
 def open_cluster(config: RunConfig, incarnation: int, place: Place) -> Cluster:
     """The run's parts under its engine."""
     if config.engine == "process":
-        return process_cluster(config, incarnation)
-    return ray_cluster(config, incarnation, place)
+        return ProcessCluster(config, incarnation)
+    return RayCluster(config, incarnation, place)
 
 
 def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list[str]]:
@@ -249,6 +249,6 @@ def final_evaluation(config: RunConfig, cluster: Cluster, weights: WeightsSnapsh
     seeds = list(range(first, first + config.final_eval_episodes))
     shared = cluster.calls.put(weights)
     try:
-        return evaluate_in_parallel(cluster.calls, config.env, shared, seeds, cluster.eval_tasks)
+        return evaluate_in_parallel(cluster.calls, config.env, shared, seeds, cluster.limits.eval_tasks)
     except CallFailed as failure:
         raise RunFailed(f"the evaluation at the end {failure.fault} again and again: {failure.reason}") from failure

@@ -9,10 +9,10 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
-from actors.service.fault_policy import CallFailed, Component, ComponentFailed, Fault, first_line
-from actors.service.rpc import Calls, Node
+from actors.service.fault_policy import CallFailed, ComponentFailed, Fault, first_line
+from actors.service.rpc import Calls, Placed
 from actors.storage.fragment_writer import FileSum, WriteResult, join_results
 from actors.storage.uri import Location
 from learner.checkpoints.checkpoint import Retention, commit_checkpoint, prune_checkpoints
@@ -44,16 +44,16 @@ class CheckpointResult(NamedTuple):
     failure: ComponentFailed | None = None
 
 
-class SavingComponent(NamedTuple):
-    """A part of the run that has been told to save itself: which, of which incarnation, and its node with `saved`."""
+class Checkpointable(Protocol):
+    """A node that saves itself as fragments of a checkpoint: the learner, or a rollout worker."""
 
-    component: Component
-    incarnation: int
-    node: Node
+    def save(self, location: Location) -> dict[str, Any]:
+        """Starts to write its fragments to `location`; returns the rest of its state, for JSON."""
+        ...
 
-    def failed(self, failure: CallFailed) -> ComponentFailed:
-        """The failure as one of the part."""
-        return ComponentFailed(self.component, self.incarnation, failure.fault, f"saved: {failure.reason}")
+    def saved(self, timeout_s: float = 0.0) -> WriteResult | None:
+        """How the last `save` ended; None while it is still being written after `timeout_s`."""
+        ...
 
 
 class Abandoned(Exception):
@@ -91,7 +91,7 @@ class CheckpointWriter:
         position: RunPosition,
         draft: Location,
         state: dict[str, Any],
-        writers: list[SavingComponent],
+        writers: list[Placed[Checkpointable]],
         seal: Callable[[], Retention],
     ) -> None:
         """Goes on in the background, once every part has begun to save.
@@ -113,7 +113,7 @@ class CheckpointWriter:
 
         self._start(position, write)
 
-    def abort(self, position: RunPosition, writers: list[SavingComponent], failure: ComponentFailed) -> None:
+    def abort(self, position: RunPosition, writers: list[Placed[Checkpointable]], failure: ComponentFailed) -> None:
         """Waits in the background until `writers` are ready for another checkpoint: this one could not begin.
 
         Args:
@@ -151,7 +151,7 @@ class CheckpointWriter:
         except OSError:
             pass  # whatever kept the checkpoint from being written; the next one tidies up
 
-    def _parts(self, writers: list[SavingComponent]) -> dict[str, FileSum]:
+    def _parts(self, writers: list[Placed[Checkpointable]]) -> dict[str, FileSum]:
         """Waits until all parts have written, even if one has failed: the next checkpoint must find them ready."""
         deadline_s = time.monotonic() + DEADLINE_S
         waiting, written, failures = list(writers), [], []
@@ -175,7 +175,7 @@ class CheckpointWriter:
             raise failures[0]
         return _files(written)
 
-    def _ask(self, writer: SavingComponent) -> WriteResult | None:
+    def _ask(self, writer: Placed[Checkpointable]) -> WriteResult | None:
         """How a part's write ended; None while it is being written.
 
         Raises:
@@ -184,16 +184,15 @@ class CheckpointWriter:
         """
         late_s = time.monotonic() + self._patience_s
         try:
-            ref = self._calls.start(writer.node, "saved")
+            ref = self._calls.start(writer.node, Checkpointable.saved)
             while not self._calls.wait([ref], POLL_S):
                 if self._abandoned.is_set():
                     raise Abandoned
                 if time.monotonic() > late_s:
                     raise CallFailed(Fault.LATE, f"silent for {self._patience_s:.0f} s")
-            answer: WriteResult | None = self._calls.get(ref)
+            return self._calls.get(ref)
         except CallFailed as failure:
-            raise writer.failed(failure) from failure
-        return answer
+            raise failure.of(writer.component, writer.incarnation, "saved") from failure
 
     def poll(self) -> CheckpointResult | None:
         """How the checkpoint under way ended, told once; None while it is being written, or there is none."""

@@ -10,11 +10,10 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar, TypeVarTuple
 
 import psutil
 import ray
-from ray.actor import ActorHandle
 from ray.exceptions import (
     ActorUnavailableError,
     AuthenticationError,
@@ -35,13 +34,23 @@ from actors.rollout.node import RolloutNode
 from actors.rollout.vector_env import EnvSpec, env_shape
 from actors.service.fault_policy import CallFailed, ComponentFailed, Fault, first_line
 from actors.service.messages import EpisodeStats
-from actors.service.rpc import LocalCalls, Node, Ref
+from actors.service.rpc import Handle, LocalCalls, Ref, local_handle
 from learner.config import RunConfig
 from learner.placement import DEADLINE_S, Place
 from learner.ray_backend.auth import HOW, guard_ray
-from learner.training.cluster import Cluster, learner_settings, rollout_settings, shard_settings
+from learner.training.cluster import (
+    Cluster,
+    Limits,
+    learner_settings,
+    rollout_settings,
+    shard_settings,
+)
 from learner.update.learner_node import LearnerNode
 from sim_core.checks import ConfigError, require
+
+N = TypeVar("N")
+T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
 
 PUSHES_IN_FLIGHT = 2
 """Pushes of a worker that may be under way while it collects: shards that live with the learner wait for updates."""
@@ -100,28 +109,31 @@ class RayCalls:
     def __init__(self, deadline_s: float) -> None:
         self._deadline_s = deadline_s
 
-    def start(self, node: Node, method: str, *args: Any) -> Ref:
+    def start(self, node: Handle[N], method: Callable[[N, *Ts], T], *args: *Ts) -> Ref[T]:
         """Starts an actor's method."""
-        return getattr(node, method).remote(*args)
+        ref: Ref[T] = getattr(node, method.__name__).remote(*args)
+        return ref
 
-    def run(self, function: Callable[..., Any], *args: Any) -> Ref:
+    def run(self, function: Callable[[*Ts], T], *args: *Ts) -> Ref[T]:
         """Starts a function as a Ray task; it takes no CPU slot, so that it never waits for the run's own actors."""
-        return _task(function).remote(*args)
+        ref: Ref[T] = _task(function).remote(*args)
+        return ref
 
-    def wait(self, refs: list[Ref], timeout_s: float) -> list[Ref]:
+    def wait(self, refs: list[Ref[T]], timeout_s: float) -> list[Ref[T]]:
         """Blocks until one of `refs` is there or the time is over; returns all that are, in the given order."""
         ray.wait(refs, num_returns=1, timeout=timeout_s, fetch_local=False)
         ready, _ = ray.wait(refs, num_returns=len(refs), timeout=0, fetch_local=False)
         return [ref for ref in refs if ref in set(ready)]
 
-    def get(self, ref: Ref) -> Any:
+    def get(self, ref: Ref[T]) -> T:
         """The result behind `ref`.
 
         Raises:
           CallFailed: the call could not be made, its result is gone, or the deadline passed.
         """
         try:
-            return ray.get(ref, timeout=self._deadline_s)
+            result: T = ray.get(ref, timeout=self._deadline_s)
+            return result
         except GetTimeoutError as error:
             raise CallFailed(Fault.LATE, f"no answer within {self._deadline_s:.0f} s") from error
         except RayError as error:
@@ -130,26 +142,29 @@ class RayCalls:
                 raise
             raise fault from error
 
-    def put(self, value: Any) -> Ref:
+    def put(self, value: T) -> Ref[T]:
         """Puts a value into the object store."""
-        return ray.put(value)
-
-
-def _make_learner(config: RunConfig, shards: list[Node], calls: RayCalls) -> LearnerNode:
-    """Builds the learner in its actor; without shard actors, its shards too."""
-    shape = env_shape(config.env)
-    settings = learner_settings(config, shape)
-    if shards:
-        return LearnerNode(settings, shards, calls, draws_ahead=config.replay == "uniform")
-    embedded: list[Node] = [ShardNode(settings) for settings in shard_settings(config, shape)]
-    return LearnerNode(settings, embedded, LocalCalls())
+        ref: Ref[T] = ray.put(value)
+        return ref
 
 
 class LearnerActor(LearnerNode):
-    """LearnerNode built from the config, so that no large constructor argument breaks a restart."""
+    """LearnerNode that is made in its actor; it embeds the shards if they have no actors of their own.
 
-    def __init__(self, config: RunConfig, shards: list[Node], calls: RayCalls) -> None:
-        self.__dict__ = _make_learner(config, shards, calls).__dict__
+    Args:
+      config: the run.
+      shards: actors of the shards, or none.
+      calls: how to call them.
+    """
+
+    def __init__(self, config: RunConfig, shards: list[Handle[ShardNode]], calls: RayCalls) -> None:
+        shape = env_shape(config.env)
+        settings = learner_settings(config, shape)
+        if shards:
+            super().__init__(settings, shards, calls, prefetch=config.replay == "uniform")
+        else:
+            embedded = [local_handle(ShardNode(shard)) for shard in shard_settings(config, shape)]
+            super().__init__(settings, embedded, LocalCalls())
 
 
 def cpus_needed(config: RunConfig) -> int:
@@ -234,59 +249,67 @@ def evaluate_in_tasks(spec: EnvSpec, candidate: Candidate, seeds: list[int], add
         leave()
 
 
-def ray_cluster(config: RunConfig, incarnation: int, place: Place) -> Cluster:
-    """Places the run's parts as Ray actors (see `connect` for errors)."""
-    connect(cpus_needed(config), place.address)
-    inner = RayCalls(place.deadline_s * INNER_SHARE)
-    shape = env_shape(config.env)
-    own = config.replay_placement == "actors"
+class RayCluster(Cluster):
+    """The nodes of a run as Ray actors.
 
-    def place_shard(index: int, incarnation: int) -> Node:
-        return _actor(ShardNode).remote(shard_settings(config, shape, incarnation)[index])
+    Args:
+      config: the run.
+      incarnation: see Cluster.
+      options: the cluster's address, and deadlines.
 
-    shards = [place_shard(index, 0) for index in range(config.replay_shards)] if own else []
-    learner = _actor(LearnerActor, learner_gpus(config)).remote(config, shards, inner)
-    targets = shards or [learner]
+    Raises:
+      ConfigError: see `connect` and `learner_gpus`.
+    """
 
-    def place_worker(worker_id: int, incarnation: int) -> Node:
-        settings = rollout_settings(config)
-        return _actor(RolloutNode).remote(settings, worker_id, incarnation, inner, targets, PUSHES_IN_FLIGHT)
+    def __init__(self, config: RunConfig, incarnation: int, options: Place) -> None:
+        connect(cpus_needed(config), options.address)
+        self._shape = env_shape(config.env)
+        self._node_calls = RayCalls(options.deadline_s * INNER_SHARE)
+        limits = Limits(
+            deadline_s=options.deadline_s,
+            start_deadline_s=options.start_deadline_s,
+            collects_in_flight=COLLECTS_IN_FLIGHT,
+            blocks_in_flight=config.workers * (COLLECTS_IN_FLIGHT + PUSHES_IN_FLIGHT),
+            updates_in_flight=UPDATES_IN_FLIGHT,
+            eval_tasks=cluster_cpus(),
+        )
+        calls = RayCalls(max(options.deadline_s, options.start_deadline_s))
+        super().__init__(config, incarnation, calls, limits)
 
-    workers = [place_worker(worker_id, incarnation) for worker_id in range(config.workers)]
+    def place_learner(self) -> Handle[LearnerNode]:
+        """Starts the learner's actor, which embeds the shards if they have no actors of their own."""
+        return _start_actor(LearnerActor, learner_gpus(self.config), self.config, self.shards, self._node_calls)
 
-    def abandon() -> None:
-        for node in {*targets, learner, *workers}:
-            _discard(node)
+    def place_worker(self, worker_id: int, incarnation: int) -> Handle[RolloutNode]:
+        """Starts the actor of a rollout worker."""
+        settings = rollout_settings(self.config)
+        arguments = (settings, worker_id, incarnation, self._node_calls, self.targets, PUSHES_IN_FLIGHT)
+        return _start_actor(RolloutNode, 0, *arguments)
 
-    return Cluster(
-        calls=RayCalls(max(place.deadline_s, place.start_deadline_s)),
-        incarnation=incarnation,
-        learner=learner,
-        workers=workers,
-        targets=targets,
-        shards_are_parts=own,
-        place_worker=place_worker,
-        place_shard=place_shard,
-        discard=_discard,
-        deadline_s=place.deadline_s,
-        start_deadline_s=place.start_deadline_s,
-        collects_in_flight=COLLECTS_IN_FLIGHT,
-        blocks_in_flight=config.workers * (COLLECTS_IN_FLIGHT + PUSHES_IN_FLIGHT),
-        updates_in_flight=UPDATES_IN_FLIGHT,
-        eval_tasks=cluster_cpus(),
-        abandon=abandon,
-        close=leave,
-    )
+    def place_shard(self, index: int, incarnation: int) -> Handle[ShardNode]:
+        """Starts the actor of an empty shard."""
+        return _start_actor(ShardNode, 0, shard_settings(self.config, self._shape, incarnation)[index])
 
+    def discard(self, node: Handle[Any]) -> None:
+        """Kills an actor."""
+        ray.kill(node)
 
-def _actor(kind: type, gpus: int = 0) -> Any:
-    """`kind` as a Ray actor; no restarts by Ray itself, which would not know the incarnation."""
-    return ray.remote(num_cpus=1, num_gpus=gpus, max_restarts=0, max_task_retries=0)(kind)
+    def cancel(self, ref: Ref[Any]) -> None:
+        """Cancels a task; Ray kills its process if it does not end by itself."""
+        ray.cancel(ref, force=True)
+
+    def abandon(self) -> None:
+        """Kills all actors."""
+        for node in (*self.shards, self.learner, *self.workers):
+            ray.kill(node)
+
+    def close(self) -> None:
+        """Leaves the cluster (see `leave`)."""
+        leave()
 
 
-def _discard(what: Any) -> None:
-    """Ends an actor, or a call that nobody waits for any more. Ray kills a process that does not go by itself."""
-    if isinstance(what, ActorHandle):
-        ray.kill(what)
-    else:
-        ray.cancel(what, force=True)
+def _start_actor(kind: Callable[[*Ts], N], gpus: int, *args: *Ts) -> Handle[N]:
+    """Starts `kind(*args)` as a Ray actor; Ray must not restart it, since it does not know the incarnation."""
+    actor = ray.remote(num_cpus=1, num_gpus=gpus, max_restarts=0, max_task_retries=0)(kind)
+    handle: Handle[N] = actor.remote(*args)
+    return handle

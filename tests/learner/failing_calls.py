@@ -36,7 +36,7 @@ class FailingCalls(LocalCalls):
         self._turn = threading.RLock()
 
     def start(self, node, method, *args):
-        later = Later(node, method, args)
+        later = Later(node, method.__name__, args)
         with self._turn:
             self._queues[id(node)].append(later)
         return later
@@ -45,7 +45,7 @@ class FailingCalls(LocalCalls):
         try:
             return Done(function(*map(self._value, args)))
         except CallFailed as error:  # of a call whose result is an argument
-            later = Later(None, function, args)
+            later = Later(None, function.__name__, args)
             later.ran, later.error = True, error
             return later
 

@@ -30,7 +30,7 @@ class DeferredCalls(LocalCalls):
     """Calls that run when somebody asks for them, as if in another, busy process."""
 
     def start(self, node, method, *args):
-        return Later(node, method, args)
+        return Later(node, method.__name__, args)
 
     def get(self, ref):
         if not ref.done:
@@ -217,7 +217,7 @@ class Unreliable(LocalCalls):
         self.faults = list(faults)
 
     def start(self, node, method, *args):
-        fault, made = self.faults.pop(0) if method == "add" and self.faults else (None, True)
+        fault, made = self.faults.pop(0) if method.__name__ == "add" and self.faults else (None, True)
         result = super().start(node, method, *args) if made else None
         return (fault, result)
 

@@ -6,7 +6,7 @@ import pytest
 
 from actors.replay.prioritised import PrioritySettings
 from actors.rollout.vector_env import env_shape
-from learner.training.cluster import learner_settings, process_cluster, rollout_settings, shard_settings
+from learner.training.cluster import ProcessCluster, learner_settings, rollout_settings, shard_settings
 
 
 def test_settings_are_those_of_the_config(small_run):
@@ -42,7 +42,7 @@ def test_shards_share_the_capacity_and_draw_from_their_own_streams(small_run):
 @pytest.mark.parametrize("placement", ["learner", "actors"])
 def test_workers_push_to_the_shards_of_either_placement(small_run, placement):
     config = dataclasses.replace(small_run, replay_placement=placement, replay_shards=2, workers=2)
-    cluster = process_cluster(config, 5)
+    cluster = ProcessCluster(config, 5)
     weights = cluster.learner.weights()
     for worker in cluster.workers:
         worker.set_weights(weights)

@@ -48,7 +48,7 @@ def start_all(pacer, setup, under_way, calls):
     while under_way.count("update") < calls and (updates := pacer.updates_due()):
         assert updates == setup.updates_per_call
         assert pacer.state.inserted >= setup.min_replay
-        pacer.sampling(updates)
+        pacer.record_sample(updates)
         under_way.append("update")
 
 
@@ -64,14 +64,14 @@ def simulate(setup, calls, seed, events, short=True, loss=0.0):
         assert under_way, "deadlock"
         kind = under_way.pop(rng.randrange(len(under_way)))
         if kind == "block":  # the first blocks hold fewer rows (n-step), a duplicate none
-            pacer.inserted(rng.choice([setup.block_rows, setup.block_rows - 1, 0]) if short else setup.block_rows)
+            pacer.record_insert(rng.choice([setup.block_rows, setup.block_rows - 1, 0]) if short else setup.block_rows)
         if rng.random() < loss:
             before = pacer.state
-            pacer.lost(rng.choice([0.1, 0.5, 1.0]))
+            pacer.write_off(rng.choice([0.1, 0.5, 1.0]))
             assert pacer.state.written_off >= before.written_off
             if "update" in under_way:
                 under_way.remove("update")
-                pacer.not_sampled(setup.updates_per_call)
+                pacer.undo_sample(setup.updates_per_call)
         ahead = pacer.state.inserted * setup.samples_per_insert - pacer.state.sampled - pacer.state.written_off
         assert ahead <= highest + (calls * setup.batch_size * setup.updates_per_call if loss else 0) + 1e-6
         assert loss or ahead >= lowest - 1e-6 or not pacer.state.sampled
@@ -88,14 +88,14 @@ def test_losses_do_not_deadlock(setup, calls, seed):
 def test_after_the_loss_of_all_the_replay_fills_up_as_at_the_start():
     pacer = Pacer(*Setup(2.0, 100, 10, 5, 20, 2))
     for _ in range(9):
-        pacer.inserted(20)
+        pacer.record_insert(20)
     while pacer.updates_due():
-        pacer.sampling(5)
-    pacer.lost(1.0)
+        pacer.record_sample(5)
+    pacer.write_off(1.0)
     held = 0
     while not pacer.updates_due():
         assert pacer.may_collect(0)
-        pacer.inserted(20)
+        pacer.record_insert(20)
         held += 20
     assert held == 100  # min_replay
 
@@ -107,10 +107,10 @@ def test_new_transitions_are_sampled_as_often_whatever_was_lost():
     sampled = {}
     for i in range(2_000):
         if i in lost_at:
-            pacer.lost(lost_at[i])
-        pacer.inserted(20)
+            pacer.write_off(lost_at[i])
+        pacer.record_insert(20)
         while pacer.updates_due():
-            pacer.sampling(1)
+            pacer.record_sample(1)
         sampled[i] = pacer.state.sampled
     assert (sampled[1_999] - sampled[999]) / (1_000 * 20) == pytest.approx(2.0, rel=1e-3)
     assert pacer.ratio() < 2.0
@@ -118,10 +118,10 @@ def test_new_transitions_are_sampled_as_often_whatever_was_lost():
 
 def test_updates_that_could_not_be_made_are_taken_back():
     pacer = Pacer(*Setup(4.0, 1, 8, 1, 8, 1))
-    pacer.inserted(8)
+    pacer.record_insert(8)
     before = pacer.state
-    pacer.sampling(3)
-    pacer.not_sampled(3)
+    pacer.record_sample(3)
+    pacer.undo_sample(3)
     assert pacer.state == before
 
 
@@ -147,28 +147,28 @@ def test_a_stalled_learner_stops_the_workers_and_the_other_way_round():
     setup = Setup(2.0, 100, 10, 5, 20, 2)
     pacer = Pacer(*setup)
     while pacer.may_collect(0):
-        pacer.inserted(20)
+        pacer.record_insert(20)
     # 2 x inserted must stay within 200 + 2 x 50 + 2 x 20 x 2 = 380.
     assert pacer.state.inserted == 180
     calls = 0
     while pacer.updates_due():
-        pacer.sampling(5)
+        pacer.record_sample(5)
         calls += 1
     assert calls == 4 and pacer.state.sampled == 200  # 360 - 200 = 160 is below 200
 
 
 def test_nothing_is_sampled_before_the_start_size():
     pacer = Pacer(*Setup(4.0, 100, 1, 1, 1, 1))
-    pacer.inserted(99)
+    pacer.record_insert(99)
     assert pacer.updates_due() == 0
-    pacer.inserted(1)
+    pacer.record_insert(1)
     assert pacer.updates_due() == 1
 
 
-def test_blocks_under_way_count_as_inserted():
+def test_blocks_in_flight_count_as_inserted():
     pacer = Pacer(*Setup(1.0, 10, 1, 1, 10, 3))  # at most 10 + 2 + 30 = 42
     assert [pacer.may_collect(under_way) for under_way in range(5)] == [True, True, True, True, False]
-    pacer.inserted(10)
+    pacer.record_insert(10)
     assert [pacer.may_collect(under_way) for under_way in range(4)] == [True, True, True, False]
 
 
@@ -176,9 +176,9 @@ def test_blocks_under_way_count_as_inserted():
 @settings(max_examples=30, deadline=None)
 def test_a_saved_state_decides_the_same(setup, seed):
     pacer = simulate(setup, 1, seed, 60)
-    pacer.waited(to_insert=True)
-    pacer.waited(to_insert=False)
-    pacer.waited(to_insert=False)
+    pacer.record_wait(to_insert=True)
+    pacer.record_wait(to_insert=False)
+    pacer.record_wait(to_insert=False)
     resumed = Pacer(*setup)
     resumed.state = PacingState(**pacer.state._asdict())
     assert resumed.state == pacer.state and pacer.state[2:4] == (1, 2)
@@ -186,15 +186,15 @@ def test_a_saved_state_decides_the_same(setup, seed):
         assert resumed.updates_due() == pacer.updates_due()
         assert [resumed.may_collect(i) for i in range(4)] == [pacer.may_collect(i) for i in range(4)]
         for one in (pacer, resumed):
-            one.sampling(one.updates_due())
-            one.inserted(setup.block_rows)
+            one.record_sample(one.updates_due())
+            one.record_insert(setup.block_rows)
 
 
 def test_the_ratio_is_unknown_before_the_first_insert():
     pacer = Pacer(*Setup(4.0, 1, 8, 1, 8, 1))
     assert math.isnan(pacer.ratio())
-    pacer.inserted(8)
-    pacer.sampling(3)
+    pacer.record_insert(8)
+    pacer.record_sample(3)
     assert pacer.ratio() == 3.0
 
 

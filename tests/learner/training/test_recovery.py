@@ -15,8 +15,7 @@ from learner.checkpoints.checkpoint import newest_valid
 from learner.checkpoints.writer import CheckpointWriter
 from learner.loop import TrainingLoop
 from learner.tracking.journal import Journal
-from learner.training import cluster as cluster_module
-from learner.training.cluster import process_cluster
+from learner.training.cluster import ProcessCluster, rollout_settings
 from learner.training.recovery import RunLost
 from learner.update.learner_node import LearnerNode
 from tests.learner.failing_calls import FailingCalls
@@ -26,7 +25,7 @@ KINDS = ("dies before", "dies after", "unreachable before", "unreachable after")
 
 class Listener:
     def __init__(self):
-        self.failures, self.mends, self.rows, self.checkpoints, self.unwritten = [], [], [], [], []
+        self.failures, self.recoveries, self.rows, self.checkpoints, self.unwritten = [], [], [], [], []
 
     def row(self, row):
         self.rows.append(row)
@@ -40,8 +39,8 @@ class Listener:
     def failed(self, failure, decision):
         self.failures.append((failure, decision))
 
-    def mended(self, mended):
-        self.mends.append(mended)
+    def recovered(self, recovered):
+        self.recoveries.append(recovered)
 
 
 @pytest.fixture
@@ -77,8 +76,8 @@ def run(monkeypatch, tmp_path):
         if not free_running:
             monkeypatch.setattr(CheckpointWriter, "_start", start_and_wait)
         calls = FailingCalls(fault, seed)
-        monkeypatch.setattr(cluster_module, "LocalCalls", lambda: calls)
-        cluster = process_cluster(config, 0)._replace(collects_in_flight=2, blocks_in_flight=2 * config.workers)
+        cluster = ProcessCluster(config, 0, calls)
+        cluster.limits = cluster.limits._replace(collects_in_flight=2, blocks_in_flight=2 * config.workers)
         listener = Listener()
         with closing(Journal(tmp_path / "metrics.jsonl", 0)) as journal:
             loop = TrainingLoop(config, cluster, journal, tmp_path / "checkpoints", listener, bool, FaultTracker())
@@ -117,7 +116,7 @@ def once(node_class, method, kind, number=3):
 
 def assert_accounts(loop, listener, config):
     ledger, pacing = loop._progress.ledger, loop._progress.pacer.state
-    assert ledger.balances
+    assert ledger.produced == ledger.stored + sum(ledger.dropped.values())
     assert (pacing.inserted, pacing.sampled) == (ledger.stored, loop.updates * config.batch_size)
     for row in listener.rows:
         metrics = row.metrics
@@ -191,7 +190,7 @@ def test_a_restarted_worker_has_a_new_incarnation_fresh_streams_and_the_current_
     incarnations = [worker._worker._incarnation for worker in cluster.workers]
     assert incarnations == [1 if i == worker_id else 0 for i in range(3)]
     assert cluster.workers[worker_id]._worker.policy_version > 0
-    assert [mended.component for mended in listener.mends] == [failure.component]
+    assert [recovered.component for recovered in listener.recoveries] == [failure.component]
     state = newest_valid(tmp_path / "checkpoints")[0].state
     assert state["incarnation"] == 1
 
@@ -200,9 +199,7 @@ def test_the_old_incarnation_of_a_worker_is_refused_everywhere(run, config):
     loop, calls, listener, cluster = run(config, once(RolloutNode, "collect", "unreachable after", 10))
     ((failure, _),) = listener.failures
     stored = loop._progress.ledger.stored
-    zombie = RolloutNode(
-        cluster_module.rollout_settings(config), failure.component.number, 0, calls, cluster.targets, 0
-    )
+    zombie = RolloutNode(rollout_settings(config), failure.component.number, 0, calls, cluster.targets, 0)
     zombie.set_weights(loop.newest_weights())
     zombie._worker._sequence = 1_000  # blocks that no shard has seen
     for _ in range(3):

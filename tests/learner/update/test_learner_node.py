@@ -341,7 +341,7 @@ class OvertakenCalls(LocalCalls):
         self.blocks = blocks
 
     def start(self, node, method, *args):
-        if method == "set_priorities":
+        if method.__name__ == "set_priorities":
             node.add(next(self.blocks))
         return super().start(node, method, *args)
 
@@ -362,7 +362,7 @@ def test_a_checkpoint_waits_for_answers(tmp_path, make_learner, make_rows):
         late = []
 
         def start(self, node, method, *args):
-            if method != "set_priorities":
+            if method.__name__ != "set_priorities":
                 return super().start(node, method, *args)
             self.late.append((node, args))
             return Done(len(self.late) - 1)

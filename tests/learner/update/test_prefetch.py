@@ -24,7 +24,7 @@ def make_learner(learner_settings, make_rows):
     def make(num_shards=1, calls=None):
         dtype = make_rows(0).dtype
         shards = [ShardNode(ShardSettings(dtype, 100, seed)) for seed in range(num_shards)]
-        return LearnerNode(learner_settings, shards, calls or LocalCalls(), draws_ahead=True), shards
+        return LearnerNode(learner_settings, shards, calls or LocalCalls(), prefetch=True), shards
 
     return make
 
@@ -131,7 +131,7 @@ class LosingCalls(LocalCalls):
     loses, drawn = None, 0
 
     def start(self, node, method, *args):
-        if method == "sample" and node is self.loses:
+        if method.__name__ == "sample" and node is self.loses:
             self.drawn += 1
             if self.drawn > 1:
                 return Done(self)
