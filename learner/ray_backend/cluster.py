@@ -41,7 +41,6 @@ from learner.ray_backend.auth import HOW, guard_ray
 from learner.training.cluster import (
     Cluster,
     Limits,
-    learner_settings,
     rollout_settings,
     shard_settings,
 )
@@ -159,12 +158,11 @@ class LearnerActor(LearnerNode):
 
     def __init__(self, config: RunConfig, shards: list[Handle[ShardNode]], calls: RayCalls) -> None:
         shape = env_shape(config.env)
-        settings = learner_settings(config, shape)
         if shards:
-            super().__init__(settings, shards, calls, prefetch=config.replay == "uniform")
+            super().__init__(config, shape, shards, calls, prefetch=config.replay == "uniform")
         else:
             embedded = [local_handle(ShardNode(shard)) for shard in shard_settings(config, shape)]
-            super().__init__(settings, embedded, LocalCalls())
+            super().__init__(config, shape, embedded, LocalCalls())
 
 
 def cpus_needed(config: RunConfig) -> int:

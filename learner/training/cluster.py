@@ -19,29 +19,9 @@ from actors.service.rpc import Calls, Handle, LocalCalls, Ref, local_handle
 from learner.checkpoints.writer import Checkpointable
 from learner.config import RunConfig
 from learner.update.learner_node import LearnerNode
-from learner.update.updates import LearnerSettings
 
 LAST_WRITE_S = 60.0
 """How long nodes of this process may go on writing after an error; a disk that hangs must not hide that error."""
-
-
-def learner_settings(config: RunConfig, shape: EnvShape) -> LearnerSettings:
-    """The learner's settings of a run."""
-    return LearnerSettings(
-        observation_size=shape.observation_size,
-        num_actions=shape.num_actions,
-        hidden_sizes=config.hidden_sizes,
-        double=config.algorithm == "double_dqn",
-        batch_size=config.batch_size,
-        target_update_interval=config.target_update_interval,
-        max_gradient_norm=config.max_gradient_norm,
-        gradients=config.gradients,
-        seed=config.seed,
-        network=config.network,
-        loss=config.loss,
-        soft_target_rate=config.target_update_rate if config.target_update == "soft" else None,
-        device=config.device,
-    )
 
 
 def rollout_settings(config: RunConfig) -> RolloutSettings:
@@ -176,7 +156,7 @@ class ProcessCluster(Cluster):
     def place_learner(self) -> Handle[LearnerNode]:
         """Makes the learner, with shards of its own if there are no others."""
         shards = self.shards or [self.place_shard(index, 0) for index in range(self.config.replay_shards)]
-        return local_handle(LearnerNode(learner_settings(self.config, self._shape), shards, self.calls))
+        return local_handle(LearnerNode(self.config, self._shape, shards, self.calls))
 
     def place_worker(self, worker_id: int, incarnation: int) -> Handle[RolloutNode]:
         """Makes a rollout worker whose pushes are stored when `collect` returns."""

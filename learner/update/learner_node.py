@@ -14,16 +14,18 @@ from safetensors.torch import load_file, save_file
 
 from actors.policy.network import WeightsSnapshot
 from actors.replay.node import ShardNode
+from actors.rollout.vector_env import EnvShape
 from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind
 from actors.service.messages import STORES, WAITS, AddReply, Delivered, Draws, TransitionBlock
 from actors.service.rpc import Calls, Handle, Ref
 from actors.service.stopwatch import Stopwatch
 from actors.storage.fragment_writer import FragmentWriter, WriteResult, join_results
 from actors.storage.uri import Location, fetched, join_location
+from learner.config import RunConfig
 from learner.update.double_dqn import importance_weights
 from learner.update.learner import Learner
 from learner.update.prefetch import NoPrefetch, Prefetch
-from learner.update.updates import LearnerSettings, UpdateStats
+from learner.update.updates import UpdateStats
 
 T = TypeVar("T")
 
@@ -63,22 +65,28 @@ class LearnerNode:
     """The learner with its replay shards, which it embeds or which are nodes of their own.
 
     Args:
-      settings: see LearnerSettings.
+      config: the run.
+      shape: spaces of its environment.
       shards: where to sample from.
       calls: how to call the shards.
       prefetch: whether the rows of the next call of updates are drawn during this one (see `Prefetch`).
     """
 
     def __init__(
-        self, settings: LearnerSettings, shards: Sequence[Handle[ShardNode]], calls: Calls, prefetch: bool = False
+        self,
+        config: RunConfig,
+        shape: EnvShape,
+        shards: Sequence[Handle[ShardNode]],
+        calls: Calls,
+        prefetch: bool = False,
     ) -> None:
         torch.set_num_threads(1)
-        self._settings = settings
-        self._learner = Learner(settings)
+        self._batch_size = config.batch_size
+        self._learner = Learner(config, shape)
         self._shards = list(shards)
         self._shard_incarnations = [0] * len(shards)
         self._calls = calls
-        self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence((settings.seed, 1))))
+        self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence((config.seed, 1))))
         self._masses = np.zeros(len(shards), np.float64)
         self._priority_updates: dict[int, Ref[float]] = {}
         self._samples = Prefetch(self._sample) if prefetch else NoPrefetch(self._sample)
@@ -133,11 +141,11 @@ class LearnerNode:
           ComponentFailed: a shard failed, and no update was made.
         """
         self._watch.lap(WAITS)
-        count = updates * self._settings.batch_size
+        count = updates * self._batch_size
         sample, weights = self._samples.take(count), None
         self._watch.lap(SAMPLES)
         if sample.draws is not None:
-            weights = importance_weights(sample.draws.probability, self._settings.batch_size, importance_exponent)
+            weights = importance_weights(sample.draws.probability, self._batch_size, importance_exponent)
         self._samples.begin(count)
         stats = self._learner.update(sample.columns, learning_rate, weights)
         self._watch.lap(UPDATES)

@@ -1,5 +1,6 @@
 """The learner's node: sampling over shards, publication, state; and one contract for both placements of a shard."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -29,13 +30,14 @@ def make_block(rows, sequence=0, worker_id=0, incarnation=0, version=0, schema=S
 
 
 @pytest.fixture
-def make_learner(learner_settings, make_rows):
+def make_learner(learner_config, learner_shape, make_rows):
     """Function: a learner with embedded shards; also gives the shards."""
 
     def make(num_shards=1, capacity=50, priorities=None, calls=None, **other):
         settings = [ShardSettings(make_rows(0).dtype, capacity, seed, priorities) for seed in range(num_shards)]
         shards = [ShardNode(setting) for setting in settings]
-        return LearnerNode(learner_settings._replace(**other), shards, calls or LocalCalls()), shards
+        config = dataclasses.replace(learner_config, **other)
+        return LearnerNode(config, learner_shape, shards, calls or LocalCalls()), shards
 
     return make
 
@@ -319,14 +321,14 @@ def test_rows_of_all_shards_are_drawn_in_proportion_to_their_priorities(make_lea
 
 
 @pytest.mark.parametrize("exponent", [0.0, 0.4, 1.0])
-def test_updates_count_their_rows_by_importance(make_learner, make_rows, learner_settings, exponent):
+def test_updates_count_their_rows_by_importance(make_learner, make_rows, learner_config, learner_shape, exponent):
     learner, (shard,) = make_learner(priorities=HALF)
     twin, (other,) = make_learner(priorities=HALF)
     for copy in (shard, other):
         copy.add(make_block(make_rows(50)))
         copy.set_priorities(np.arange(50), np.geomspace(0.1, 9, 50).astype(np.float32))
     learner.update(3, RATE, exponent)
-    plain = Learner(learner_settings)
+    plain = Learner(learner_config, learner_shape)
     sample = other.sample(3 * 16)
     probability = other.shard.priorities[sample.draws.insertion_index] / other.shard.priorities.sum()
     plain.update(sample.columns, RATE, importance_weights(probability, 16, exponent))

@@ -18,13 +18,13 @@ WAIT_S = 60.0
 
 
 @pytest.fixture
-def make_learner(learner_settings, make_rows):
+def make_learner(learner_config, learner_shape, make_rows):
     """Function: a learner that draws ahead from so many shards, and the shards."""
 
     def make(num_shards=1, calls=None):
         dtype = make_rows(0).dtype
         shards = [ShardNode(ShardSettings(dtype, 100, seed)) for seed in range(num_shards)]
-        return LearnerNode(learner_settings, shards, calls or LocalCalls(), prefetch=True), shards
+        return LearnerNode(learner_config, learner_shape, shards, calls or LocalCalls(), prefetch=True), shards
 
     return make
 
