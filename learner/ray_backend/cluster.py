@@ -1,7 +1,7 @@
-"""The module that knows Ray (sweeps have `tune_edge`): it places the plain classes as Ray actors and calls them.
+"""Places the nodes of a run as Ray actors and calls them; translates Ray's errors into faults.
 
-Rollout workers push to the shards themselves; the driver holds references and small reports only. The
-embedded shards live in the learner's actor; with `replay_placement = "actors"` each has its own.
+Rollout workers push to the shards themselves; the driver holds references and small reports only. The shards are
+embedded in the learner's actor, or with `replay_placement = "actors"` each is an actor of its own.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from actors.service.messages import EpisodeStats
 from actors.service.rpc import Handle, LocalCalls, Ref, local_handle
 from learner.config import RunConfig
 from learner.placement import DEADLINE_S, Place
-from learner.ray_backend.auth import HOW, guard_ray
+from learner.ray_backend.auth import TOKEN_HELP, guard_ray
 from learner.training.cluster import (
     Cluster,
     Limits,
@@ -52,31 +52,33 @@ T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 
 PUSHES_IN_FLIGHT = 2
-"""Pushes of a worker that may be under way while it collects: shards that live with the learner wait for updates."""
+"""Pushes that a worker may have in flight while it collects: embedded shards answer only between calls of updates."""
 COLLECTS_IN_FLIGHT = 2
-"""Collects of a worker that are started ahead, so that it never waits for the driver."""
+"""Collects that a worker may have in flight, so that it never waits for the driver."""
 UPDATES_IN_FLIGHT = 2
-"""Calls of updates that are started ahead, so that the learner never waits for the driver."""
+"""Calls of updates that the learner may have in flight, so that it never waits for the driver."""
 INNER_SHARE = 0.3
-"""Share of the deadline that parts give each other, so that one that waits, twice in a row, is not itself late."""
+"""Share of the deadline that nodes give each other, so that a node that waits twice in a row is not itself late."""
 RAYLET = "raylet"
-"""Name of the process that a Ray of our own starts its workers from."""
+"""Name of the process from which a local Ray starts its workers."""
 FAULTS: tuple[tuple[tuple[type[Exception], ...], Fault], ...] = (
     ((ActorUnavailableError,), Fault.UNREACHABLE),
     ((RayActorError, WorkerCrashedError, NodeDiedError, OutOfMemoryError, TaskCancelledError), Fault.DIED),
     ((ObjectLostError,), Fault.OBJECT_LOST),
     ((GetTimeoutError,), Fault.LATE),
 )
-"""What errors of Ray mean; the first match counts."""
-OWN_RAY = {
+"""The fault that each error of Ray stands for; the first match counts."""
+LOCAL_RAY = {
     "idle_worker_killing_time_threshold_ms": 24 * 3_600_000,
     "task_events_report_interval_ms": 0,
     "max_direct_call_object_size": 2**20,
 }
-"""Settings of a Ray of our own. It keeps processes that wait for tasks: evaluations are tasks beside actors that take
-all CPU slots, and Ray would end their process after a second and start the next one from nothing. It keeps no list of
-the last 100,000 calls, 300 MB that only its dashboard would show, and there is none. And it sends blocks of up to a
-MiB in the call itself; past its own 100 KiB they would go through the object store, which costs several calls more."""
+"""Settings of a Ray that this process starts, each against a default that costs a run time or memory.
+
+Idle worker processes are kept: an evaluation is a task beside actors that take all CPU slots, and Ray would kill its
+process after a second and start the next one from nothing. The last 100,000 calls are not recorded: that takes 300 MB,
+and only Ray's dashboard shows them. Blocks of up to 1 MiB travel in the call itself: above Ray's default of 100 KiB
+they would go through the object store, which costs several more calls."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
@@ -86,7 +88,7 @@ def _task(function: Callable[..., Any]) -> Any:
 
 
 def _as_fault(error: Exception) -> Exception:
-    """What an error of Ray means; what our own code raised stays as it is."""
+    """The fault that an error of Ray stands for; an error that our own code raised, unchanged."""
     if isinstance(error, RayTaskError):
         cause = getattr(error, "cause", None)
         if isinstance(cause, CallFailed | ComponentFailed):
@@ -102,7 +104,7 @@ class RayCalls:
     """Calls of Ray actors; implements `actors.service.rpc.Calls`.
 
     Args:
-      deadline_s: `get` waits no longer.
+      deadline_s: most time that `get` waits.
     """
 
     def __init__(self, deadline_s: float) -> None:
@@ -114,12 +116,12 @@ class RayCalls:
         return ref
 
     def run(self, function: Callable[[*Ts], T], *args: *Ts) -> Ref[T]:
-        """Starts a function as a Ray task; it takes no CPU slot, so that it never waits for the run's own actors."""
+        """Starts a function as a Ray task, which takes no CPU slot: the run's actors may hold them all."""
         ref: Ref[T] = _task(function).remote(*args)
         return ref
 
     def wait(self, refs: list[Ref[T]], timeout_s: float) -> list[Ref[T]]:
-        """Blocks until one of `refs` is there or the time is over; returns all that are, in the given order."""
+        """Blocks until one of `refs` is there or the time is over; returns those that are there, in the given order."""
         ray.wait(refs, num_returns=1, timeout=timeout_s, fetch_local=False)
         ready, _ = ray.wait(refs, num_returns=len(refs), timeout=0, fetch_local=False)
         return [ref for ref in refs if ref in set(ready)]
@@ -148,7 +150,7 @@ class RayCalls:
 
 
 class LearnerActor(LearnerNode):
-    """LearnerNode that is made in its actor; it embeds the shards if they have no actors of their own.
+    """The learner's actor, which embeds the shards if they have no actors of their own.
 
     Args:
       config: the run.
@@ -166,21 +168,21 @@ class LearnerActor(LearnerNode):
 
 
 def cpus_needed(config: RunConfig) -> int:
-    """CPU slots that the run's actors take: one a rollout worker, shard actor and learner."""
+    """CPU slots that the run's actors take: one each for a rollout worker, a shard actor and the learner."""
     shards = config.replay_shards if config.replay_placement == "actors" else 0
     return config.workers + shards + 1
 
 
 def cluster_cpus() -> int:
-    """CPU slots of the cluster that this process has joined."""
+    """CPU slots of the Ray cluster that this process has joined."""
     return int(ray.cluster_resources().get("CPU", 0))
 
 
 def learner_gpus(config: RunConfig) -> int:
-    """GPUs to keep for the learner in the cluster that this process has joined.
+    """GPUs to reserve for the learner in the Ray cluster that this process has joined: 0 or 1.
 
     Raises:
-      ConfigError: the config wants CUDA, and the cluster has no GPU.
+      ConfigError: the config asks for CUDA, and the cluster has no GPU.
     """
     if config.device == "cpu":
         return 0
@@ -191,25 +193,26 @@ def learner_gpus(config: RunConfig) -> int:
 
 
 def connect(cpus: int, address: str | None) -> None:
-    """Joins the cluster at `address`, or starts Ray on this machine with room for `cpus` CPU slots.
+    """Joins the Ray cluster at `address`; if it is None, starts Ray on this machine with at least `cpus` CPU slots.
 
     Raises:
-      ConfigError: the cluster cannot be reached, wants another token, or has too few CPUs.
+      ConfigError: the cluster cannot be reached, refuses the token, or has too few CPUs.
     """
     if ray.is_initialized():
-        return  # an earlier attempt of this run has joined
+        return  # by an earlier attempt of this run
     guard_ray(address is not None)
-    os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # of calls to parts that have been replaced
+    os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # from calls of nodes that have been replaced
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     options: dict[str, Any] = {"address": address}
     if address is None:
         options = {"address": "local", "include_dashboard": False, "num_cpus": max(cpus, os.cpu_count() or 1)}
-        options["_system_config"] = OWN_RAY
+        options["_system_config"] = LOCAL_RAY
     try:
         ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
     except (ConnectionError, AuthenticationError) as error:
         raise ConfigError(
-            f"no Ray cluster answers at {address!r}; start one with `ray start --head`, or for one with tokens {HOW}"
+            f"no Ray cluster answers at {address!r}; start one with `ray start --head`, "
+            f"or for one with tokens {TOKEN_HELP}"
         ) from error
     have = cluster_cpus()
     if have < cpus:
@@ -221,23 +224,24 @@ def connect(cpus: int, address: str | None) -> None:
 
 
 def leave() -> None:
-    """Leaves the cluster; a Ray of our own ends with all of its processes.
+    """Leaves the Ray cluster; a Ray that this process started ends with all of its processes.
 
-    A worker of Ray may hang for good in its own end, after its raylet has gone, and Ray looks after it no more.
+    A worker process may hang for good while it exits after its raylet has gone, when Ray no longer looks after it. So
+    all of them are killed.
     """
     raylets = [child for child in psutil.Process().children() if child.name() == RAYLET]
-    family = [process for raylet in raylets for process in raylet.children(recursive=True)]
+    workers = [process for raylet in raylets for process in raylet.children(recursive=True)]
     ray.shutdown()
-    for process in family:
+    for process in workers:
         with suppress(psutil.NoSuchProcess):
             process.kill()
 
 
 def evaluate_in_tasks(spec: EnvSpec, candidate: Candidate, seeds: list[int], address: str | None) -> EpisodeStats:
-    """Plays one episode a seed in Ray tasks on all CPUs (see `connect` for errors).
+    """Plays one episode per seed in Ray tasks on all CPUs (see `connect` for errors).
 
     Returns:
-      One entry a seed, in order.
+      One entry per seed, in order.
     """
     connect(1, address)
     calls = RayCalls(DEADLINE_S)

@@ -9,7 +9,7 @@ import pytest
 from actors.rollout.vector_env import env_shape
 from learner.config import RunConfig
 from learner.training.cluster import ProcessCluster
-from learner.training.memory_estimate import check_fits, parts_bytes
+from learner.training.memory_estimate import bytes_by_setting, check_fits
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 
@@ -55,15 +55,15 @@ def bytes_of_a_full_shard(config):
 
 def test_the_estimates_are_those_of_what_is_made(small_run):
     shape = env_shape(small_run.env)
-    parts = parts_bytes(small_run, shape)
+    parts = bytes_by_setting(small_run, shape)
     learner = ProcessCluster(small_run, 0).learner
     larger = dataclasses.replace(small_run, replay_capacity=6_000)
     full = bytes_of_a_full_shard(larger)
-    assert full <= parts_bytes(larger, shape)["replay_capacity"] < 1.3 * full
+    assert full <= bytes_by_setting(larger, shape)["replay_capacity"] < 1.3 * full
     online = sum(tensor.numel() for tensor in learner._learner.online.state_dict().values())
     assert parts["hidden_sizes"] == online * 4 * 5
     prioritised = dataclasses.replace(small_run, replay="prioritised", network="dueling")
-    more, (shard, *_) = parts_bytes(prioritised, shape), ProcessCluster(prioritised, 0).learner._shards
+    more, (shard, *_) = bytes_by_setting(prioritised, shape), ProcessCluster(prioritised, 0).learner._shards
     tree = prioritised.replay_shards * shard.shard._tree._tree.nbytes
     assert tree <= more["replay_capacity"] - parts["replay_capacity"] < 2.1 * tree
     assert more["hidden_sizes"] > parts["hidden_sizes"]
