@@ -1,4 +1,4 @@
-"""The training loop ends where it was told to, however far ahead its rollout workers go."""
+"""The training loop ends where it should, however far its rollout workers run ahead."""
 
 import dataclasses
 from collections import Counter
@@ -41,7 +41,7 @@ def test_no_round_of_blocks_is_ordered_past_the_end(small_run, tmp_path, workers
 
 
 @pytest.mark.parametrize("workers", [1, 3])
-def test_a_checkpoint_waits_for_one_call_of_each_part(small_run, tmp_path, monkeypatch, workers):
+def test_a_checkpoint_waits_for_one_call_of_each_component(small_run, tmp_path, monkeypatch, workers):
     block = small_run.block_env_steps
     config = dataclasses.replace(
         small_run, workers=workers, total_env_steps=60 * block, checkpoint_every_env_steps=10 * block, min_replay=block
@@ -51,7 +51,7 @@ def test_a_checkpoint_waits_for_one_call_of_each_part(small_run, tmp_path, monke
     def note():
         rounds.append(most())
         if loop._checkpoints._writer._thread is not None:
-            loop._checkpoints._writer._thread.join()  # so that every checkpoint that is due is begun
+            loop._checkpoints._writer._thread.join()  # so that no due checkpoint is held up by the one before
 
     def most():
         calls = Counter(call.component for call in loop._in_flight._calls.values())
@@ -63,5 +63,5 @@ def test_a_checkpoint_waits_for_one_call_of_each_part(small_run, tmp_path, monke
         begin = loop.begin_checkpoint
         monkeypatch.setattr(loop, "begin_checkpoint", lambda: (begun.append(most()), begin()))
         assert loop.run()
-    assert max(rounds) == 2  # else there is nothing to hold back
+    assert max(rounds) == 2  # else nothing was held back
     assert len(begun) >= 5 and max(begun) == 1

@@ -29,7 +29,7 @@ def test_options_reach_the_learner_and_the_shards(small_run):
     assert isinstance(learner.online, DuelingNetwork) and learner.device.type == "cpu"
 
 
-def test_shards_share_the_capacity_and_draw_from_their_own_streams(small_run):
+def test_shards_share_the_capacity_and_have_their_own_random_streams(small_run):
     config = dataclasses.replace(small_run, replay_shards=3)
     settings = shard_settings(config, env_shape(config.env))
     assert [shard.capacity for shard in settings] == [333, 333, 333]

@@ -1,4 +1,4 @@
-"""Calls in flight, and who is late, by a clock that the tests move."""
+"""Calls in flight, and which components are late, by a clock that the tests move."""
 
 import pytest
 
@@ -57,7 +57,7 @@ def test_a_replaced_worker_owes_nothing(in_flight):
     assert (collects(in_flight), in_flight.blocks) == ([0, 1], [0, 1])
 
 
-def test_nobody_is_late_before_the_deadline(in_flight, clock):
+def test_no_component_is_late_before_the_deadline(in_flight, clock):
     started(in_flight, *WORKERS)
     in_flight.add(collect(0, "a"))
     assert in_flight.time_left_s() == 10.0
@@ -70,11 +70,11 @@ def test_nobody_is_late_before_the_deadline(in_flight, clock):
     assert in_flight.time_left_s() == 0.0
 
 
-def test_who_answers_is_given_the_whole_deadline_again(in_flight, clock):
+def test_an_answer_starts_the_deadline_again(in_flight, clock):
     started(in_flight, LEARNER)
     in_flight.add(update("u"))
     clock[0] += 6
-    in_flight.add(update("v"))  # queued behind the first: the time of waiting in line does not count
+    in_flight.add(update("v"))  # queued behind the first call: time in the queue does not count
     clock[0] += 3
     in_flight.take("u")
     clock[0] += 9
@@ -83,7 +83,7 @@ def test_who_answers_is_given_the_whole_deadline_again(in_flight, clock):
     assert [failure.component for failure in in_flight.late([])] == [LEARNER]
 
 
-def test_who_owes_nothing_is_never_late(in_flight, clock):
+def test_a_component_that_owes_no_answer_is_never_late(in_flight, clock):
     in_flight.add(collect(0, "a"))
     in_flight.take("a")
     clock[0] += 1e6
@@ -93,7 +93,7 @@ def test_who_owes_nothing_is_never_late(in_flight, clock):
     assert in_flight.time_left_s() == 10.0
 
 
-def test_an_answer_that_waits_to_be_taken_is_not_late(in_flight, clock):
+def test_an_answer_that_has_not_been_taken_yet_is_not_late(in_flight, clock):
     """The loop itself may have been busy for longer than the deadline."""
     started(in_flight, *WORKERS)
     in_flight.add(collect(0, "a"))
@@ -102,7 +102,7 @@ def test_an_answer_that_waits_to_be_taken_is_not_late(in_flight, clock):
     assert [failure.component for failure in in_flight.late(["a"])] == [WORKERS[1]]
 
 
-def test_a_part_that_starts_has_more_time_and_so_has_its_replacement(in_flight, clock):
+def test_a_starting_component_has_more_time_and_so_has_its_replacement(in_flight, clock):
     in_flight.add(collect(0, "a"))
     clock[0] += 59
     assert in_flight.late([]) == []
@@ -118,7 +118,7 @@ def test_a_part_that_starts_has_more_time_and_so_has_its_replacement(in_flight, 
     assert [failure.incarnation for failure in in_flight.late([])] == [1]
 
 
-def test_every_evaluation_starts_anew(in_flight, clock):
+def test_every_evaluation_has_the_time_of_a_start(in_flight, clock):
     for ref in ("a", "b"):
         in_flight.add(PendingCall("eval", EVALUATOR, 0, ref, print))
         clock[0] += 59
@@ -126,7 +126,7 @@ def test_every_evaluation_starts_anew(in_flight, clock):
         in_flight.take(ref)
 
 
-def test_each_late_part_is_named_once(in_flight, clock):
+def test_each_late_component_is_reported_once(in_flight, clock):
     for call in (collect(0, "a"), collect(0, "b"), collect(1, "c"), update("u"), update("v")):
         in_flight.add(call)
     clock[0] += 60

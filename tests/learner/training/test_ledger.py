@@ -1,4 +1,4 @@
-"""The accounts balance when nothing is lost, when something is, and not when a hop cheats."""
+"""The accounts balance with and without losses, and do not when a hop loses or doubles a block unnoticed."""
 
 import json
 
@@ -51,14 +51,14 @@ def test_dropped_blocks_balance_under_their_reason(ledger, reason):
     assert ledger.dropped[reason] == 90 and ledger.replay_size == 0
 
 
-def test_a_block_that_nobody_reports_is_missed(ledger):
+def test_an_unreported_block_unbalances_the_accounts(ledger):
     ledger.record_block(report(90, 90))
-    ledger.record_block(report(100, 290))  # 100 more were made in between
+    ledger.record_block(report(100, 290))  # 100 more were produced in between
     assert not balances(ledger)
     assert totals(ledger) == (290, 190, 0, 4)
 
 
-def test_a_block_that_is_reported_twice_is_noticed(ledger):
+def test_a_block_that_is_reported_twice_unbalances_the_accounts(ledger):
     for _ in range(2):
         ledger.record_block(report(90, 90))
     assert not balances(ledger)
@@ -70,7 +70,7 @@ def test_a_full_shard_holds_its_capacity(ledger):
     assert ledger.replay_size == 1_000 and ledger.stored == 1_800
 
 
-def test_a_lost_worker_leaves_what_it_had_delivered(ledger):
+def test_what_a_lost_worker_delivered_counts_as_stored(ledger):
     ledger.record_block(report(90, 90))
     ledger.record_block(report(100, 190, shard=1))
     # Shard 0 has stored one more block of 100 that nobody reported; the one before, of 50, never arrived.
@@ -79,17 +79,17 @@ def test_a_lost_worker_leaves_what_it_had_delivered(ledger):
     assert totals(ledger) == (340, 290, 50, 7) and balances(ledger)
     assert ledger.dropped[Dropped.WORKER_LOST] == 50
     assert ledger.replay_size == 290
-    ledger.record_block(report(80, 80))  # its successor counts from nothing
+    ledger.record_block(report(80, 80))  # its replacement counts from 0
     assert totals(ledger) == (420, 370, 50, 9) and balances(ledger)
 
 
-def test_a_worker_that_had_reported_all_leaves_nothing_open(ledger):
+def test_a_lost_worker_that_had_reported_everything_changes_nothing(ledger):
     ledger.record_block(report(90, 90))
     assert ledger.write_off_worker(0, [Delivered(90, 100, 2, 90), Delivered()]) == Delivered()
     assert totals(ledger) == (90, 90, 0, 2)
 
 
-def test_a_lost_shard_is_empty_and_names_its_share(ledger):
+def test_a_lost_shard_is_empty_and_its_share_is_returned(ledger):
     ledger.record_block(report(300, 300))
     ledger.record_block(report(100, 400, shard=1))
     assert ledger.write_off_shard(0, 4) == 0.75
@@ -99,14 +99,14 @@ def test_a_lost_shard_is_empty_and_names_its_share(ledger):
     assert ledger.replay_size == 0 and balances(ledger)
 
 
-def test_what_a_lost_shard_had_taken_counts_as_dropped(ledger):
+def test_a_block_that_was_pushed_to_a_lost_shard_counts_as_dropped(ledger):
     ledger.write_off_shard(0, 4)
     assert ledger.record_block(report(90, 90)) == 0
     assert ledger.record_block(report(100, 190, shard_incarnation=4)) == 100
     assert ledger.dropped[Dropped.SHARD_LOST] == 90 and balances(ledger) and ledger.replay_size == 100
 
 
-def test_a_worker_lost_after_a_shard_is_not_owed_what_the_shard_had(ledger):
+def test_a_worker_lost_after_a_shard_is_settled_with_the_new_shard_only(ledger):
     ledger.record_block(report(90, 90))
     ledger.write_off_shard(0, 4)
     ledger.record_block(report(50, 140, shard_incarnation=4))
@@ -121,11 +121,11 @@ def test_the_row_has_the_accounts(ledger):
     assert ledger.row() == {f"account/{name}": value for name, value in expected.items()}
 
 
-def test_a_saved_state_goes_on(ledger):
+def test_a_restored_state_goes_on(ledger):
     ledger.record_block(report(90, 90))
     ledger.record_block(report(10, 100, dropped=Dropped.SHARD_LOST))
     resumed = Ledger(2, [1_000, 1_000])
     resumed.set_state(json.loads(json.dumps(ledger.get_state())))
     assert resumed.get_state() == ledger.get_state() and resumed.replay_size == 90
-    resumed.record_block(report(70, 70))  # of the next incarnation, which counts from nothing
+    resumed.record_block(report(70, 70))  # of the next incarnation, which counts from 0
     assert totals(resumed) == (170, 160, 10, 6) and balances(resumed)

@@ -1,4 +1,4 @@
-"""What no machine can hold is refused at the start; what a run takes is estimated from what it makes."""
+"""Runs that no machine can hold are refused at the start; estimates match what a run allocates."""
 
 import dataclasses
 
@@ -38,13 +38,13 @@ def test_the_defaults_fit():
         ),
     ],
 )
-def test_what_no_machine_holds_is_refused_by_its_setting(changes, part):
+def test_a_run_that_no_machine_can_hold_is_refused_with_the_setting_to_blame(changes, part):
     with pytest.raises(ConfigError, match=f"of it by {part}, and this machine has"):
         check_fits(dataclasses.replace(RunConfig(), **changes))
 
 
 def bytes_of_a_full_shard(config):
-    """Bytes of a shard's rings once that of the rows is full."""
+    """Bytes of a shard's rings once the ring of rows is full."""
     cluster = ProcessCluster(config, 0)
     worker, shard = cluster.workers[0], cluster.learner._shards[0].shard
     worker.set_weights(cluster.learner.weights())
@@ -53,7 +53,7 @@ def bytes_of_a_full_shard(config):
     return shard._rows.nbytes + shard._frames.slots.nbytes
 
 
-def test_the_estimates_are_those_of_what_is_made(small_run):
+def test_estimates_match_what_is_allocated(small_run):
     shape = env_shape(small_run.env)
     parts = bytes_by_setting(small_run, shape)
     learner = ProcessCluster(small_run, 0).learner

@@ -1,4 +1,4 @@
-"""Compiled updates are those of PyTorch's autograd and Adam, whatever the network's shape and the options."""
+"""Compiled updates equal those of PyTorch's autograd and Adam, for any shape of network and any options."""
 
 import dataclasses
 
@@ -30,7 +30,7 @@ def columns_of(count, shape, num_actions, seed=0, weighted=False):
     found = {
         "observation": rng.normal(size=(count, *shape)),
         "next_observation": rng.normal(size=(count, *shape)),
-        "reward": rng.normal(scale=2, size=count),  # TD errors on both sides of Huber's corner
+        "reward": rng.normal(scale=2, size=count),  # TD errors on both sides of |d| = 1, where Huber's loss changes
         "discount": rng.choice([0.0, 0.97], size=count),
     }
     if weighted:
@@ -43,7 +43,7 @@ def columns_of(count, shape, num_actions, seed=0, weighted=False):
 @pytest.mark.parametrize("options", [{}, {"loss": "mse"}, SOFT, {"max_gradient_norm": 100.0}])
 @pytest.mark.parametrize("algorithm", ["double_dqn", "dqn"])
 @pytest.mark.parametrize(("shape", "hidden_sizes", "num_actions", "size"), SHAPES)
-def test_an_update_is_that_of_autograd(
+def test_an_update_equals_that_of_autograd(
     learner_config, shape, hidden_sizes, num_actions, size, algorithm, options, weighted
 ):
     settings = {"hidden_sizes": hidden_sizes, "batch_size": size, "algorithm": algorithm, "gradients": "autograd"}
@@ -65,11 +65,11 @@ def test_an_update_is_that_of_autograd(
         torch.testing.assert_close(state[name], other_state[name], rtol=1e-3, atol=1e-5 * largest)
     for flat, other in ((online, other_online), (target, other_target)):
         apart = (flat.values - other.values).detach().abs().mean()
-        assert float(apart) < 1e-3 * RATE  # Adam's step of a gradient of nearly nothing may be of either sign
+        assert float(apart) < 1e-3 * RATE  # Adam's step for a gradient near 0 may have either sign
 
 
 @pytest.mark.parametrize("change", [torch.nan, torch.inf])
-def test_what_diverged_shows(learner_config, change):
+def test_divergence_shows_in_the_statistics(learner_config, change):
     compiled, online, _, _ = maker(CompiledUpdates, dataclasses.replace(learner_config, hidden_sizes=(8, 8)), (6,), 3)
     columns = columns_of(16, (6,), 3)
     columns["reward"][3] = change
@@ -85,7 +85,7 @@ def test_ties_are_broken_as_by_pytorch(learner_config):
     compiled, online, target, _ = maker(CompiledUpdates, config, (6,), 3)
     plain, other, _, _ = maker(TorchUpdates, config, (6,), 3)
     for network in (online, other):
-        network.values.data.zero_()  # every action is worth as much; the target network tells them apart
+        network.values.data.zero_()  # all actions are tied online; the target network tells them apart
     columns = columns_of(16, (6,), 3)
     errors = compiled(columns, RATE, 0)[1]
     np.testing.assert_allclose(errors, plain(columns, RATE, 0)[1], rtol=1e-5, atol=1e-6)

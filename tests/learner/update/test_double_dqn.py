@@ -1,4 +1,4 @@
-"""Targets and loss against hand-computed numbers and brute force."""
+"""TD targets, losses and importance weights against numbers computed by hand and brute force."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_dqn_by_hand():
     assert td_targets(TARGET, TARGET, REWARD, DISCOUNT).tolist() == pytest.approx(expected)
 
 
-def test_they_agree_exactly_where_both_networks_prefer_the_same():
+def test_both_algorithms_agree_where_both_networks_prefer_the_same_action():
     equal = td_targets(TARGET, ONLINE, REWARD, DISCOUNT) == td_targets(TARGET, TARGET, REWARD, DISCOUNT)
     assert equal.tolist() == [True, False]
     assert torch.equal(td_targets(TARGET, TARGET, REWARD, DISCOUNT), REWARD + DISCOUNT * TARGET.amax(dim=1))
@@ -53,7 +53,7 @@ def test_targets_equal_a_loop(make_rows, double):
     np.testing.assert_allclose(result.numpy(), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_loss_is_the_mean_mean_loss_of_the_taken_actions():
+def test_the_loss_is_the_mean_huber_loss_of_the_taken_actions():
     q_tm1 = torch.tensor([[0.0, 9.0], [9.0, 1.0], [2.0, 9.0]])
     target = torch.tensor([0.5, 4.0, -0.25])
     loss, td_error = mean_loss(q_tm1, torch.tensor([0, 1, 0]), target)
@@ -61,7 +61,7 @@ def test_loss_is_the_mean_mean_loss_of_the_taken_actions():
     assert loss.item() == pytest.approx((0.5 * 0.25 + (3.0 - 0.5) + (2.25 - 0.5)) / 3)
 
 
-def test_mean_square_of_the_taken_actions_errors_by_hand():
+def test_the_mean_squared_error_of_the_taken_actions_by_hand():
     q_tm1 = torch.tensor([[0.0, 9.0], [9.0, 1.0]])
     target, weight = torch.tensor([0.5, 4.0]), torch.tensor([1.0, 0.1])
     assert mean_loss(q_tm1, torch.tensor([0, 1]), target, "mse")[0].item() == pytest.approx((0.25 + 9) / 2)
@@ -87,14 +87,14 @@ def test_loss_and_gradient_equal_the_closed_form(name, weighted):
 
 
 def test_importance_weights_by_hand():
-    """Four stored transitions, minibatches of two: 1 / (4 P) to the power of beta, over the minibatch's greatest."""
+    """Four stored transitions, minibatches of two: 1 / (4 P) to the power of beta, scaled to a greatest of 1."""
     weights = importance_weights(np.array([0.5, 0.25, 0.125, 0.125]), 2, 0.5)
     assert weights.dtype == np.float32
     assert weights.tolist() == pytest.approx([2**-0.5, 1, 1, 1])
     np.testing.assert_array_equal(importance_weights(np.array([0.5, 0.25]), 2, 0.0), [1, 1])
 
 
-def test_importance_weights_are_the_papers():
+def test_importance_weights_equal_the_formula_of_the_paper():
     rng = np.random.default_rng(0)
     stored = rng.uniform(0.01, 1.0, 1000)
     stored /= stored.sum()
@@ -105,7 +105,7 @@ def test_importance_weights_are_the_papers():
         np.testing.assert_allclose(importance_weights(drawn.ravel(), 32, exponent).reshape(5, 32), expected, rtol=1e-6)
 
 
-def test_whole_importance_weights_take_all_of_the_bias_away():
+def test_importance_weights_with_beta_1_remove_all_of_the_bias():
     """beta = 1: the weighted mean over prioritised draws is the plain mean over all that is stored."""
     rng = np.random.default_rng(1)
     values = rng.normal(size=50)
@@ -115,7 +115,7 @@ def test_whole_importance_weights_take_all_of_the_bias_away():
     spread = values[drawn] * weights
     error = 4 * spread.std() / np.sqrt(200_000) / weights.mean()
     assert spread.mean() / weights.mean() == pytest.approx(values.mean(), abs=error)
-    assert abs(values[drawn].mean() - values.mean()) > 5 * error  # or nothing would be tested
+    assert abs(values[drawn].mean() - values.mean()) > 5 * error  # else nothing would be tested
 
 
 def test_no_gradient_flows_into_the_target():
@@ -126,7 +126,7 @@ def test_no_gradient_flows_into_the_target():
     assert not td_error.requires_grad
 
 
-def test_a_minibatch_is_its_slice(make_rows):
+def test_a_minibatch_is_a_slice_of_the_columns(make_rows):
     columns = {name: torch.from_numpy(make_rows(10)[name].copy()) for name in make_rows(10).dtype.names}
     batch = minibatch(columns, slice(4, 7))
     rows = make_rows(10)[4:7]

@@ -1,4 +1,4 @@
-"""The learner against a hand-written update, and on tasks whose action values are known."""
+"""The learner against an update written out by hand, and on tasks whose action values are known."""
 
 import copy
 import dataclasses
@@ -95,7 +95,7 @@ def test_updates_equal_those_of_a_plain_loop(
         elif i % 2:
             target.load_state_dict(online.state_dict())
     stats = learner.update(rows, RATE, weights.astype(np.float32) if weighted else None)
-    assert max(norms) > config.max_gradient_norm  # or clipping would not be tested
+    assert max(norms) > config.max_gradient_norm  # else clipping would not be tested
     assert_same(learner.online, online, rtol=0, atol=1e-6)
     assert_same(learner.target, target, rtol=0, atol=1e-6)
     assert stats.loss == pytest.approx(np.mean(losses), rel=1e-5)
@@ -130,7 +130,7 @@ def test_the_target_is_copied_every_c_updates_and_not_between(make_learner, make
         assert_same(learner.target, copied, rtol=0)
 
 
-def test_a_soft_target_is_the_geometric_mean_of_what_went_before(make_learner, make_rows):
+def test_a_soft_target_is_the_exponential_average_of_the_online_networks(make_learner, make_rows):
     learner, rate, online = make_learner(target_update="soft", target_update_rate=0.25), 0.25, []
     start = learner.target.layers[0].weight.detach().clone()
     for update in range(6):
@@ -148,7 +148,7 @@ def test_a_soft_target_at_rate_1_is_the_online_network(make_learner, make_rows):
 
 
 @pytest.mark.parametrize("gradients", ["by_hand", "autograd"])
-def test_td_errors_are_those_before_each_update(make_learner, make_rows, gradients):
+def test_td_errors_are_measured_before_each_update(make_learner, make_rows, gradients):
     learner, alone = (make_learner(gradients=gradients) for _ in range(2))
     rows, expected = make_rows(16 * 4), []
     for start in range(0, len(rows), 16):
@@ -165,7 +165,7 @@ def test_td_errors_are_those_before_each_update(make_learner, make_rows, gradien
     np.testing.assert_allclose(learner.td_errors, np.concatenate(expected), rtol=1e-5, atol=1e-6)
 
 
-def test_columns_are_those_of_the_rows_whatever_was_there_before(make_rows):
+def test_columns_equal_the_rows_whatever_the_buffers_held_before(make_rows):
     columns_of = Columns()
     for count, seed in ((5, 0), (5, 1), (7, 2), (5, 3)):
         rows = make_rows(count, seed=seed).astype(ROW_OF_COUNTS)
@@ -177,13 +177,13 @@ def test_columns_are_those_of_the_rows_whatever_was_there_before(make_rows):
 
 
 def as_columns(rows):
-    """The rows' columns, as a shard draws them."""
+    """The columns of the rows, as a shard draws them."""
     return {name: rows[name].copy() for name in rows.dtype.names}
 
 
 @pytest.mark.parametrize("form", [np.copy, as_columns])
-def test_rows_are_left_as_they_are(make_learner, make_rows, form):
-    """A call's tensors are memory of the learner, which a next call overwrites, or the caller's own."""
+def test_the_rows_of_the_caller_are_not_changed(make_learner, make_rows, form):
+    """The tensors of a call are buffers of the learner, which the next call overwrites, or arrays of the caller."""
     learner, first, second = make_learner(), form(make_rows(32)), form(make_rows(32, seed=1))
     learner.update(first, RATE)
     learner.update(second, RATE)
@@ -193,7 +193,7 @@ def test_rows_are_left_as_they_are(make_learner, make_rows, form):
 
 
 @pytest.mark.parametrize("gradients", ["by_hand", "autograd"])
-def test_rows_and_their_columns_teach_the_same(make_learner, make_rows, gradients):
+def test_rows_and_their_columns_give_the_same_updates(make_learner, make_rows, gradients):
     one, other = (make_learner(gradients=gradients) for _ in range(2))
     for seed in range(3):
         one.update(make_rows(64, seed=seed), RATE)
@@ -210,7 +210,7 @@ def test_weights_of_1_change_nothing(make_learner, make_rows):
     assert_same(plain.online, weighted.online, rtol=0)
 
 
-def test_rows_of_weight_0_teach_nothing(make_learner, make_rows):
+def test_rows_of_weight_0_change_nothing(make_learner, make_rows):
     learner, other, rows = make_learner(), make_learner(), make_rows(16)
     weights = np.where(np.arange(16) < 8, 1, 0).astype(np.float32)
     learner.update(rows, RATE, weights)
@@ -219,7 +219,7 @@ def test_rows_of_weight_0_teach_nothing(make_learner, make_rows):
     assert_same(learner.online, other.online, rtol=0, atol=1e-7)
 
 
-def test_the_device_is_cuda_where_there_is_one(monkeypatch):
+def test_the_device_is_cuda_if_there_is_one(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert [learning_device(name).type for name in ("auto", "cpu", "cuda")] == ["cuda", "cpu", "cuda"]
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -257,7 +257,7 @@ def test_stats_are_means(make_learner, make_rows):
     assert stats.td_error == pytest.approx(np.abs(error).mean(), rel=1e-4)
 
 
-def test_the_seed_alone_decides_the_start(make_learner):
+def test_the_seed_alone_decides_the_initial_network(make_learner):
     torch.manual_seed(123)
     before = torch.random.get_rng_state()
     first = make_learner()
@@ -269,7 +269,7 @@ def test_the_seed_alone_decides_the_start(make_learner):
     assert not torch.equal(other, first.online.layers[0].weight)
 
 
-def test_weights_are_a_copy_with_the_number_of_updates(make_learner, make_rows):
+def test_published_weights_are_a_copy_with_their_version(make_learner, make_rows):
     learner = make_learner()
     weights = learner.weights(12.5)
     kept = [array.copy() for array in weights.arrays]
@@ -281,7 +281,7 @@ def test_weights_are_a_copy_with_the_number_of_updates(make_learner, make_rows):
 
 @pytest.mark.parametrize("options", OPTIONS, ids=lambda options: "-".join(map(str, options.values())) or "defaults")
 @pytest.mark.parametrize("updates", [0, 4])
-def test_a_saved_learner_goes_on_bit_by_bit(make_learner, make_rows, updates, options):
+def test_a_restored_learner_goes_on_bit_for_bit(make_learner, make_rows, updates, options):
     learner = make_learner(**options)
     if updates:
         learner.update(make_rows(16 * updates), RATE)
