@@ -35,8 +35,8 @@ from actors.rollout.vector_env import EnvSpec, env_shape
 from actors.service.fault_policy import CallFailed, ComponentFailed, Fault, first_line
 from actors.service.messages import EpisodeStats
 from actors.service.rpc import Handle, LocalCalls, Ref, local_handle
+from learner.cluster_options import DEADLINE_S, ClusterOptions
 from learner.config import RunConfig
-from learner.placement import DEADLINE_S, Place
 from learner.ray_backend.auth import TOKEN_HELP, guard_ray
 from learner.training.cluster import (
     Cluster,
@@ -263,7 +263,7 @@ class RayCluster(Cluster):
       ConfigError: see `connect` and `learner_gpus`.
     """
 
-    def __init__(self, config: RunConfig, incarnation: int, options: Place) -> None:
+    def __init__(self, config: RunConfig, incarnation: int, options: ClusterOptions) -> None:
         connect(cpus_needed(config), options.address)
         self._shape = env_shape(config.env)
         self._node_calls = RayCalls(options.deadline_s * INNER_SHARE)
