@@ -16,7 +16,7 @@ import requests
 from ray.exceptions import AuthenticationError
 from ray.job_submission import JobStatus, JobSubmissionClient
 
-from learner.ray_backend.auth import HOW
+from learner.ray_backend.auth import TOKEN_HELP
 from sim_core.checks import ConfigError
 
 ADDRESS = "RAY_API_SERVER_ADDRESS"
@@ -72,7 +72,9 @@ class JobServer:
         try:
             yield
         except AuthenticationError as error:
-            raise ConfigError(f"the Ray cluster at {self.address} asks for a token that it knows: {HOW}") from error
+            raise ConfigError(
+                f"the Ray cluster at {self.address} asks for a token that it knows: {TOKEN_HELP}"
+            ) from error
         except (ConnectionError, requests.RequestException) as error:
             raise ConfigError(
                 f"no Ray job server answers at {self.address} ({_cause(error)}); start one with `ray start --head`, "

@@ -11,8 +11,8 @@ from deploy.console.summary_tables import evaluation_table, summary_lines
 from deploy.console.training_display import make_display
 from deploy.runs.artifacts import log_artifacts
 from learner.checkpoints.checkpoint import Checkpoint
+from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig, check_files_unchanged
-from learner.placement import Place
 from learner.run import RunResult, execute
 from learner.run_folder import RunFolder, RunIdentity
 from learner.tracking.journal import Row
@@ -40,7 +40,7 @@ def print_resume_point(checkpoint: Checkpoint, skipped: list[str]) -> None:
 
 
 def resume_training(
-    folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, place: Place
+    folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, options: ClusterOptions
 ) -> int:
     """Resumes a run from a checkpoint, or from its start if it has none; returns the exit code.
 
@@ -48,14 +48,14 @@ def resume_training(
       ConfigError: the config's device is not there, or a user's own method or scene has changed.
     """
     check_files_unchanged(config)
-    check_device(config, place.address)
+    check_device(config, options.address)
     tracker.resume(folder.identity().mlflow_run_id)
     folder.save_config(config)
-    return run_training(folder, config, tracker, checkpoint, place)
+    return run_training(folder, config, tracker, checkpoint, options)
 
 
 def run_training(
-    folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, place: Place
+    folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, options: ClusterOptions
 ) -> int:
     """Trains to the end or to a signal; returns the exit code, 128 + the signal's number after one."""
     console = Console()
@@ -66,7 +66,7 @@ def run_training(
             display.message("logging curve, animation and policy")
             log_artifacts(folder, config, tracker, result, rows, display.message)
 
-        result = execute(folder, config, tracker, display, checkpoint, place, finish)
+        result = execute(folder, config, tracker, display, checkpoint, options, finish)
     if result.evaluation is None:
         name = signal.Signals(result.stopped_by).name if result.stopped_by else "a signal"
         saved = "checkpoint saved" if result.checkpoint else "its checkpoint could not be written"

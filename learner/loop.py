@@ -1,39 +1,51 @@
-"""The training loop: every hop from simulator to learned policy, in one process or over Ray actors.
+"""The training loop: act, step, store, sample, update, sync; in one process or over Ray actors.
 
-The loop holds references and small reports; transitions go from rollout worker to shard to learner.
+The loop holds references and small reports. The transitions themselves go from a rollout worker to a replay shard and
+from there to the learner; the weights go from the learner to the shards, whose replies carry them to the workers.
+
+Each method of a node that the loop calls (`RolloutNode.collect`, `LearnerNode.update`) is the next hop to read.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from functools import partial
+from typing import Any, Protocol, TypeVar, TypeVarTuple
 
 from actors.evaluation.evaluator import evaluate
 from actors.policy.network import WeightsSnapshot
 from actors.rollout.exploration import epsilon
+from actors.rollout.node import RolloutNode
 from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, FaultTracker
 from actors.service.messages import BlockReport, EpisodeStats
+from actors.service.rpc import Placed, by_reference
 from actors.storage.uri import Location
 from learner.checkpoints.checkpoint import Checkpoint
-from learner.checkpoints.writer import Checkpointer
+from learner.checkpoints.writer import CheckpointWriter
 from learner.config import RunConfig
 from learner.tracking.journal import Journal, Row
+from learner.training.checkpoint_manager import CheckpointManager, CheckpointObserver
 from learner.training.cluster import Cluster
 from learner.training.counters import Progress
 from learner.training.evaluation_summary import as_metrics, summarise
-from learner.training.in_flight import Pending, UnderWay
+from learner.training.in_flight import InFlight, PendingCall
 from learner.training.ledger import Ledger
 from learner.training.pacing import make_pacer
-from learner.training.recovery import FaultObserver, Mender, RunLost
-from learner.training.saver import LEARNER, SaveObserver, Saver
+from learner.training.recovery import FaultObserver, RunLost, Supervisor
+from learner.update.learner_node import LearnerNode
+
+N = TypeVar("N")
+T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
 
 EVAL_SEED = 1_000_000_000
-"""First seed of evaluations during training; training worlds draw theirs from other streams."""
+"""First seed of the evaluations during training; training worlds draw theirs from other streams."""
+LEARNER = Component(ComponentKind.LEARNER)
 EVALUATOR = Component(ComponentKind.EVALUATOR)
 
 
-class Observer(FaultObserver, SaveObserver, Protocol):
+class Observer(FaultObserver, CheckpointObserver, Protocol):
     """What the loop tells its surroundings."""
 
     def row(self, row: Row) -> None:
@@ -42,17 +54,17 @@ class Observer(FaultObserver, SaveObserver, Protocol):
 
 
 class TrainingLoop:
-    """One run from its start or a checkpoint to its end.
+    """Trains one run from its start or from a checkpoint to its end.
 
     Args:
       config: the run.
-      cluster: its parts.
+      cluster: its nodes.
       journal: where metrics go.
       checkpoints: folder or URL of the run's checkpoints.
-      observer: is told of rows and checkpoints.
+      observer: hears of rows, checkpoints and failures.
       stop: asked once a round; True ends the run early, with a checkpoint.
-      recovery: decides about failed parts; remembers their failures in earlier attempts.
-      keep_best: the best checkpoints that are kept beside the newest.
+      faults: decides about failed components; remembers the failures of earlier attempts.
+      keep_best: how many of the best checkpoints are kept beside the newest.
     """
 
     def __init__(
@@ -63,22 +75,28 @@ class TrainingLoop:
         checkpoints: Location,
         observer: Observer,
         stop: Callable[[], bool],
-        recovery: FaultTracker | None = None,
+        faults: FaultTracker | None = None,
         keep_best: int = 0,
     ) -> None:
+        limits = cluster.limits
         self._config = config
         self._cluster = cluster
         self._calls = cluster.calls
+        self._limits = limits
         self._journal = journal
         self._observer = observer
         self._stop = stop
-        self._pacer = make_pacer(config, cluster.blocks_in_flight)
-        self._ledger = Ledger(len(cluster.workers), cluster.capacities(config))
+        self._pacer = make_pacer(config, limits.blocks_in_flight)
+        self._ledger = Ledger(config.workers, cluster.capacities)
         self._progress = Progress(config, self._pacer, self._ledger)
-        self._under_way = UnderWay(len(cluster.workers), cluster.deadline_s, cluster.start_deadline_s)
-        self._mender = Mender(cluster, recovery or FaultTracker(), self._under_way, self._pacer, self._ledger, observer)
-        checkpointer = Checkpointer(checkpoints, cluster.calls, cluster.queue_deadline_s)
-        self._saver = Saver(config, keep_best, checkpointer, self._mender, self._progress, journal, observer)
+        self._in_flight = InFlight(config.workers, limits.deadline_s, limits.start_deadline_s)
+        self._supervisor = Supervisor(
+            cluster, faults or FaultTracker(), self._in_flight, self._pacer, self._ledger, observer
+        )
+        writer = CheckpointWriter(checkpoints, cluster.calls, limits.queue_deadline_s)
+        self._checkpoints = CheckpointManager(
+            config, keep_best, writer, self._supervisor, self._progress, journal, observer
+        )
         self._restored = False
 
     @property
@@ -93,8 +111,8 @@ class TrainingLoop:
 
     @property
     def saved(self) -> Location | None:
-        """The checkpoint of this very moment; None if it has not been written."""
-        return self._saver.saved
+        """The checkpoint of the present env steps and updates; None if there is none."""
+        return self._checkpoints.saved
 
     def run(self) -> bool:
         """Trains to `total_env_steps` or until stopped, and checkpoints the end.
@@ -103,138 +121,147 @@ class TrainingLoop:
           Whether the run is finished (else it was stopped).
 
         Raises:
-          RuntimeError: nothing is under way and nothing may start.
-          RunLost: a part failed that only a checkpoint can bring back.
-          RunFailed: a part fails again and again.
-          ComponentFailed: a part failed before the first round.
+          RuntimeError: nothing is in flight and nothing may start.
+          RunLost: a component failed that only a checkpoint can bring back.
+          RunFailed: a component failed again and again.
+          ComponentFailed: a component failed before the first round.
         """
         try:
             return self._run()
         except Exception:
-            self._give_up()
+            self._abandon()
             raise
 
-    def _give_up(self) -> None:
-        """Ends all parts, and what writes: neither must outlive its attempt, since another may begin at once."""
+    def _abandon(self) -> None:
+        """Ends all nodes and the writing of checkpoints: neither may outlive this attempt, since another may begin."""
         self._cluster.abandon()
-        self._saver.give_up()
+        self._checkpoints.abandon()
 
     def _run(self) -> bool:
         if not self._restored:
             self._send_first_weights()
         self._progress.meters.start_clock()
         while self.env_steps < self._config.total_env_steps and not self._stop():
-            if not (self._saver.is_wanted and self._evaluates()) and self._progress.is_due("eval"):
-                self._start_evaluation()  # a checkpoint that is wanted waits for one that is under way, not for two
+            self._start_evaluation_if_due()
             self._start_collects()  # act, step, store: the workers push to the shards
-            self._start_updates()  # sample, update, publish: when the pacer says so
+            self._start_updates()  # sample, update, sync: as many as the pacer allows
             self._take_results()
-            if self._progress.is_due("log"):
+            if self._progress.take_due("log"):
                 self._write_row(self._progress.row())
-            self._tend_checkpoints()  # a snapshot while nothing is under way; it is written meanwhile
+            self._checkpoint_if_due()
         self._save_the_end()
         return self.env_steps >= self._config.total_env_steps
 
     def _send_first_weights(self) -> None:
-        weights = self.newest_weights()  # here, so that a learner that is gone is not a worker's fault
-        for worker in self._mender.workers:
+        weights = self.newest_weights()  # by value: a lost learner must not look like a worker's fault
+        for worker in self._supervisor.workers:
             try:
-                self._mender.ask(worker, "set_weights", weights)
+                self._supervisor.ask(worker, RolloutNode.set_weights, weights)
             except ComponentFailed as failure:
-                self._mend(failure)
+                self._recover(failure)
 
     def _start_collects(self) -> None:
-        config = self._config
-        at_once = self._at_once(self._cluster.collects_in_flight)
-        for _ in range(at_once):
-            if self._all_is_ordered():
-                return  # between rounds, so that a resumed run has every worker's turn where it would have been
-            for part in self._mender.workers:
-                worker_id = part.number
-                if self._under_way.collects[worker_id] >= at_once:
+        """Has the rollout workers collect blocks, in turn, as far as the pacer allows."""
+        config, most = self._config, self._most_in_flight(self._limits.collects_in_flight)
+        for _ in range(most):
+            if self._all_blocks_ordered():
+                return  # between rounds of workers, so that a resumed run begins with the same worker
+            for worker_id, worker in enumerate(self._supervisor.workers):
+                if self._in_flight.count(worker.component) >= most:
                     continue
-                if not self._pacer.may_collect(self._under_way.blocks_in_flight):
-                    self._pacer.waited(to_insert=True)
+                if not self._pacer.may_collect(self._in_flight.blocks_in_flight):
+                    self._pacer.record_wait(to_insert=True)
                     return
                 rate = epsilon(config.epsilon_settings, self.env_steps, worker_id, config.workers)
-                self._start(part, "collect", 0, rate)
+                self._start(worker, RolloutNode.collect, self._take_blocks, rate)
 
-    def _all_is_ordered(self) -> bool:
-        """Whether the blocks under way make up what is left of the run."""
-        expected = self._under_way.blocks_in_flight * self._config.block_env_steps
+    def _all_blocks_ordered(self) -> bool:
+        """Whether the blocks in flight make up what is left of the run."""
+        expected = self._in_flight.blocks_in_flight * self._config.block_env_steps
         return self.env_steps + expected >= self._config.total_env_steps
 
     def _start_updates(self) -> None:
-        while self._under_way.count("update") < self._at_once(self._cluster.updates_in_flight):
+        """Starts calls of updates, as far as the pacer allows; each samples, updates, and publishes the weights."""
+        while self._in_flight.count(LEARNER) < self._most_in_flight(self._limits.updates_in_flight):
             updates = self._pacer.updates_due()
             if not updates:
-                self._pacer.waited(to_insert=False)
+                self._pacer.record_wait(to_insert=False)
                 return
-            self._pacer.sampling(updates)
-            now, config = self.env_steps, self._config
-            rates = config.learning_rate_at(now), config.importance_exponent_at(now)
-            self._start(LEARNER, "update", updates, updates, *rates)
+            self._pacer.record_sample(updates)
+            learning_rate = self._config.learning_rate_at(self.env_steps)
+            exponent = self._config.importance_exponent_at(self.env_steps)
+            take = self._progress.record_updates
+            self._start(self._supervisor.learner, LearnerNode.update, take, updates, learning_rate, exponent)
+
+    def _start(self, placed: Placed[N], method: Callable[[N, *Ts], T], take: Callable[[T], None], *args: *Ts) -> None:
+        """Starts a call of a component; `take` is called with the result once it is there."""
+        ref = self._calls.start(placed.node, method, *args)
+        self._in_flight.add(PendingCall(method.__name__, placed.component, placed.incarnation, ref, take))
+
+    def _start_evaluation_if_due(self) -> None:
+        if self._checkpoints.is_wanted and self._is_evaluating():
+            return  # a checkpoint waits for one evaluation, not for two
+        if self._progress.take_due("eval"):
+            self._start_evaluation()
 
     def _start_evaluation(self) -> None:
         seeds = list(range(EVAL_SEED, EVAL_SEED + self._config.eval_episodes))
-        ref = self._calls.run(evaluate, self._config.env, self._mender.weights_ref(), seeds)
-        self._under_way.add(ref, Pending("eval", EVALUATOR, self._mender.incarnation(EVALUATOR), self.env_steps))
+        weights = by_reference(self._supervisor.weights_ref())
+        ref = self._calls.run(evaluate, self._config.env, weights, seeds)
+        take = partial(self._take_evaluation, self.env_steps)
+        self._in_flight.add(PendingCall("eval", EVALUATOR, self._supervisor.incarnation(EVALUATOR), ref, take))
 
-    def _start(self, part: Component, method: str, amount: int, *args: Any) -> None:
-        ref = self._calls.start(self._mender.node(part), method, *args)
-        self._under_way.add(ref, Pending(method, part, self._mender.incarnation(part), amount))
+    def _is_evaluating(self) -> bool:
+        return self._in_flight.count(EVALUATOR) > 0
 
     def _take_results(self) -> None:
-        if not self._under_way and self._all_is_ordered():
+        """Waits until a call in flight has ended, and takes the results of all that have."""
+        if not self._in_flight and self._all_blocks_ordered():
             return self.settle()  # the workers report their last pushes only when they are asked
-        if not self._under_way:
-            raise RuntimeError("nothing is under way and pacing lets nothing start")
-        ready = self._calls.wait(self._under_way.refs, self._under_way.patience_s())
-        late = self._under_way.late(ready)
+        if not self._in_flight:
+            raise RuntimeError("nothing is in flight, and the pacer lets nothing start")
+        ready = self._calls.wait(self._in_flight.refs, self._in_flight.time_left_s())
+        late = self._in_flight.late(ready)
         for ref in ready:
-            pending = self._under_way.take(ref)
-            if pending is None:
-                continue  # its part was replaced a moment ago
-            try:
-                result = self._calls.get(ref)
-            except CallFailed as error:
-                self._take_failure(pending, pending.failed(error))
-            except ComponentFailed as failure:  # of a part that the called one needs
-                self._take_failure(pending, failure)
-            else:
-                self._take_result(pending, result)
-        for failed in late:
-            self._mend(failed)
+            call = self._in_flight.take(ref)
+            if call is not None:  # else its component has just been replaced
+                self._take_result(call)
+        for failure in late:
+            self._recover(failure)
 
-    def _take_result(self, pending: Pending, result: Any) -> None:
-        self._mender.worked(pending.component)
-        if pending.kind == "collect":
-            self._take_blocks(result)
-        elif pending.kind == "update":
-            self._progress.take_updates(result, pending.amount)
+    def _take_result(self, call: PendingCall[T]) -> None:
+        try:
+            result = self._calls.get(call.ref)
+        except CallFailed as failure:
+            self._take_failure(call, failure.of(call.component, call.incarnation))
+        except ComponentFailed as failure:  # of a component that the called one needs
+            self._take_failure(call, failure)
         else:
-            self._take_evaluation(result, pending.amount)
+            self._supervisor.record_success(call.component)
+            call.take(result)
 
-    def _take_failure(self, pending: Pending, failure: ComponentFailed) -> None:
-        if pending.kind == "update":
-            self._pacer.not_sampled(pending.amount)
-        self._mend(failure)
+    def _take_failure(self, call: PendingCall[Any], failure: ComponentFailed) -> None:
+        if call.component == LEARNER:
+            self._pacer.undo_sample(self._config.updates_per_call)
+        self._recover(failure)
 
-    def _mend(self, failure: ComponentFailed) -> None:
-        unreported = self._mender.mend(failure)
+    def _recover(self, failure: ComponentFailed) -> None:
+        unreported = self._supervisor.recover(failure)
         self._progress.env_steps += unreported.env_steps
         if failure.component == EVALUATOR:
             self._start_evaluation()
 
+    def _recover_if(self, failure: ComponentFailed | None) -> None:
+        if failure is not None:
+            self._recover(failure)
+
     def _take_blocks(self, reports: list[BlockReport]) -> None:
         for report in reports:
-            self._under_way.blocks[report.header.worker_id] -= 1
-            self._progress.take_block(report)
-            failure = self._mender.check_push(report)
-            if failure is not None:
-                self._mend(failure)
+            self._in_flight.blocks[report.header.worker_id] -= 1
+            self._progress.record_block(report)
+            self._recover_if(self._supervisor.check_push(report))
 
-    def _take_evaluation(self, stats: EpisodeStats, env_steps: int) -> None:
+    def _take_evaluation(self, env_steps: int, stats: EpisodeStats) -> None:
         metrics = {f"eval/{name}": value for name, value in as_metrics(summarise(stats)).items()}
         self._write_row(metrics, env_steps)
 
@@ -244,72 +271,64 @@ class TrainingLoop:
         self._observer.row(row)
 
     def settle(self) -> None:
-        """Waits until nothing is under way anywhere."""
-        while self._under_way:
+        """Waits until nothing is in flight anywhere."""
+        while self._in_flight:
             self._take_results()
-        for worker in self._mender.workers:
+        for worker in self._supervisor.workers:
             try:
-                self._take_blocks(self._mender.ask(worker, "settle"))
+                self._take_blocks(self._supervisor.ask(worker, RolloutNode.settle))
             except ComponentFailed as failure:
-                self._mend(failure)  # a new worker has nothing under way
+                self._recover(failure)  # its replacement has nothing in flight
 
-    def _evaluates(self) -> bool:
-        return self._under_way.count("eval") > 0
+    def _checkpoint_if_due(self) -> None:
+        """Takes the last checkpoint's result; begins the next if it is due and no component has two calls in flight."""
+        self._recover_if(self._checkpoints.poll())
+        self._checkpoints.is_wanted |= self._progress.take_due("checkpoint")
+        if self._checkpoint_is_next() and self._in_flight.most_of_one <= 1:
+            self.begin_checkpoint()
 
-    def _tend_checkpoints(self) -> None:
-        """Tells of a checkpoint that has ended; begins one that is due, once none and no evaluation is under way."""
-        self._mend_if(self._saver.poll())
-        self._saver.is_wanted |= self._progress.is_due("checkpoint")
-        if self._saves_soon() and max(self._under_way.count("update"), *self._under_way.collects) <= 1:
-            self.checkpoint()
+    def _checkpoint_is_next(self) -> bool:
+        """Whether a checkpoint is wanted and neither an earlier one nor an evaluation keeps it from beginning."""
+        return self._checkpoints.may_begin and not self._is_evaluating()
 
-    def _saves_soon(self) -> bool:
-        """Whether a checkpoint begins once no part has more than one call under way, which it waits for."""
-        return self._saver.may_begin and not self._evaluates()
-
-    def _at_once(self, in_flight: int) -> int:
-        """Calls that one part may have under way, of which there are `in_flight` unless a checkpoint is to begin."""
-        return 1 if self._saves_soon() else in_flight
+    def _most_in_flight(self, limit: int) -> int:
+        """Calls that a component may have in flight: `limit`, but 1 if a checkpoint is to begin soon."""
+        return 1 if self._checkpoint_is_next() else limit
 
     def _save_the_end(self) -> None:
-        """Writes a checkpoint of this moment, again where a part fails meanwhile."""
-        self._mend_if(self._saver.wait())
-        self._saver.is_wanted = self.saved is None
-        while self._saver.is_wanted:
-            self.checkpoint()
-            self._mend_if(self._saver.wait())
+        """Writes a checkpoint of the end, again if a component fails meanwhile."""
+        self._recover_if(self._checkpoints.wait())
+        self._checkpoints.is_wanted = self.saved is None
+        while self._checkpoints.is_wanted:
+            self.begin_checkpoint()
+            self._recover_if(self._checkpoints.wait())
 
-    def checkpoint(self) -> None:
-        """Begins a checkpoint of the whole run at a moment when nothing is under way; none may be being written."""
+    def begin_checkpoint(self) -> None:
+        """Begins a checkpoint of the whole run once nothing is in flight; no other may be being written."""
         self.settle()
         try:
-            self._saver.begin()
+            self._checkpoints.begin()
         except ComponentFailed as failure:
-            self._mend(failure)
-
-    def _mend_if(self, failure: ComponentFailed | None) -> None:
-        if failure is not None:
-            self._mend(failure)
+            self._recover(failure)
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Takes up a checkpoint of this config; call before `run` (see `Saver.restore` for errors)."""
-        self._saver.restore(checkpoint)
+        """Restores a checkpoint of this config; call before `run` (see `CheckpointManager.restore` for errors)."""
+        self._checkpoints.restore(checkpoint)
         self._restored = True
 
     def lost(self, failure: ComponentFailed) -> RunLost:
-        """Ends this attempt because of a failure outside of the rounds of training (see `run` for other errors)."""
-        self._give_up()
+        """Ends this attempt because of a failure outside the rounds of training (see `run` for other errors)."""
+        self._abandon()
         try:
-            self._mender.decide(failure)
+            self._supervisor.decide(failure)
         except RunLost as lost:
             return lost
-        return RunLost(failure, self._mender.highest)
+        return RunLost(failure, self._supervisor.highest)
 
     def newest_weights(self) -> WeightsSnapshot:
-        """The weights that the last update made.
+        """The weights after the last update.
 
         Raises:
           ComponentFailed: they are gone with the learner.
         """
-        weights: WeightsSnapshot = self._mender.ask(LEARNER, "weights")
-        return weights
+        return self._supervisor.ask(self._supervisor.learner, LearnerNode.weights)

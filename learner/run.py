@@ -12,12 +12,12 @@ from actors.service.fault_policy import CallFailed, ComponentFailed, FaultTracke
 from actors.service.messages import EpisodeStats
 from actors.storage.uri import Location
 from learner.checkpoints.checkpoint import Checkpoint, check_config, check_state, newest_valid
-from learner.checkpoints.manifest import CheckpointError, UselessCheckpointError
+from learner.checkpoints.manifest import CheckpointError, UnusableCheckpointError
+from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig
 from learner.file_names import CONFIG
 from learner.loop import TrainingLoop
-from learner.placement import Place
-from learner.ray_backend.cluster import ray_cluster
+from learner.ray_backend.cluster import RayCluster
 from learner.ray_backend.metrics import RayMetrics
 from learner.run_folder import RunFolder
 from learner.tracking.delivery import Delivery, insist
@@ -26,7 +26,7 @@ from learner.tracking.journal import Journal, PushedMark, Row
 from learner.tracking.mlflow_run import TROUBLE, Tracker
 from learner.tracking.observer import Display, MirroringObserver
 from learner.tracking.redaction import hide_secrets
-from learner.training.cluster import Cluster, process_cluster
+from learner.training.cluster import Cluster, ProcessCluster
 from learner.training.evaluation_summary import Evaluation, as_metrics, summarise
 from learner.training.recovery import RunLost
 from learner.training.stop_signals import stop_on_signals
@@ -53,18 +53,18 @@ class RunResult(NamedTuple):
     weights: WeightsSnapshot | None
 
 
-def open_cluster(config: RunConfig, incarnation: int, place: Place) -> Cluster:
+def open_cluster(config: RunConfig, incarnation: int, options: ClusterOptions) -> Cluster:
     """The run's parts under its engine."""
     if config.engine == "process":
-        return process_cluster(config, incarnation)
-    return ray_cluster(config, incarnation, place)
+        return ProcessCluster(config, incarnation)
+    return RayCluster(config, incarnation, options)
 
 
 def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list[str]]:
     """The newest usable checkpoint of a run, and why newer ones were skipped.
 
     Raises:
-      UselessCheckpointError: there is none, or all are damaged or too old.
+      UnusableCheckpointError: there is none, or all are damaged or too old.
       CheckpointError: it cannot be reached, is of a newer version, or belongs to another config.
     """
     checkpoint, skipped = newest_valid(folder.checkpoint_location())
@@ -81,7 +81,7 @@ def last_checkpoint(folder: RunFolder, config: RunConfig) -> Checkpoint | None:
     """
     try:
         return resume_point(folder, config)[0]
-    except UselessCheckpointError:
+    except UnusableCheckpointError:
         return None
 
 
@@ -91,7 +91,7 @@ def execute(
     tracker: Tracker,
     display: Display,
     checkpoint: Checkpoint | None,
-    place: Place,
+    options: ClusterOptions,
     finish: Callable[[RunResult, list[Row]], None],
 ) -> RunResult:
     """Trains from the start or from `checkpoint`, evaluates, and closes the MLflow run.
@@ -102,7 +102,7 @@ def execute(
       tracker: its MLflow run, started or resumed.
       display: shows progress.
       checkpoint: where to go on, None for a fresh start.
-      place: where the parts go.
+      options: of the cluster.
       finish: makes and logs the artifacts of a finished run from the result and all rows of metrics.
 
     Returns:
@@ -113,7 +113,7 @@ def execute(
     """
     status, say = "FAILED", _without_secrets(display, tracker)
     try:
-        result, rows = _train(folder, config, tracker, display, checkpoint, place)
+        result, rows = _train(folder, config, tracker, display, checkpoint, options)
         if result.evaluation is not None:
             patience_s = tracker.patience_s
             time_ms = _time_of_results(result, rows, tracker)
@@ -155,7 +155,7 @@ def _train(
     tracker: Tracker,
     display: Display,
     checkpoint: Checkpoint | None,
-    place: Place,
+    options: ClusterOptions,
 ) -> tuple[RunResult, list[Row]]:
     """Trains to the end, going back to the last checkpoint whenever a part is gone that only it can bring back."""
     recovery, faults, say = FaultTracker(), FaultLog(folder.faults), _without_secrets(display, tracker)
@@ -165,7 +165,7 @@ def _train(
     while True:
         offset = checkpoint.state["journal_offset"] if checkpoint else 0
         with closing(Journal(folder.journal, offset)) as journal:
-            cluster = open_cluster(config, incarnation, place)
+            cluster = open_cluster(config, incarnation, options)
             monitor = monitor or _monitor(folder, config)
             delivery = Delivery(tracker, journal, PushedMark(folder.pushed, offset), say)
             delivery.up_to(offset)
@@ -249,6 +249,6 @@ def final_evaluation(config: RunConfig, cluster: Cluster, weights: WeightsSnapsh
     seeds = list(range(first, first + config.final_eval_episodes))
     shared = cluster.calls.put(weights)
     try:
-        return evaluate_in_parallel(cluster.calls, config.env, shared, seeds, cluster.eval_tasks)
+        return evaluate_in_parallel(cluster.calls, config.env, shared, seeds, cluster.limits.eval_tasks)
     except CallFailed as failure:
         raise RunFailed(f"the evaluation at the end {failure.fault} again and again: {failure.reason}") from failure

@@ -1,10 +1,10 @@
-"""What tests share that save a run or a node of it."""
+"""Helpers of tests that save a run or one of its nodes."""
 
 import time
 
 
 class Silent:
-    """Watches nothing, and lets no checkpoint fail; implements `learner.loop.Observer`."""
+    """Ignores all events but a failed checkpoint, which fails the test; implements `learner.loop.Observer`."""
 
     def row(self, row):
         pass
@@ -17,7 +17,7 @@ class Silent:
 
 
 def saved(node, location):
-    """Has a node save itself and waits for the end; its state."""
+    """Has a node save itself, waits until it has, and returns its state."""
     state, deadline_s = node.save(location), time.monotonic() + 60
     while (written := node.saved()) is None:
         assert time.monotonic() < deadline_s

@@ -19,7 +19,7 @@ from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
 from actors.rollout.worker import join_stats
 from actors.service.fault_policy import Action, CallFailed, ComponentKind, decide
 from actors.service.messages import NO_OUTCOME, EpisodeStats
-from actors.service.rpc import Calls, Ref
+from actors.service.rpc import Calls, Ref, by_reference
 from sim_core.checks import require
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
@@ -72,13 +72,15 @@ def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> EpisodeSt
     return join_stats([_play(spec, make_action_rule(spec, candidate, chunk), chunk) for chunk in chunks])
 
 
-def evaluate_in_parallel(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: list[int], max_calls: int) -> EpisodeStats:
+def evaluate_in_parallel(
+    calls: Calls, spec: EnvSpec, candidate: Ref[Candidate], seeds: list[int], max_calls: int
+) -> EpisodeStats:
     """Splits an evaluation into up to `max_calls` simultaneous calls of `evaluate`.
 
     Args:
       calls: how to start the calls.
       spec: the environment.
-      candidate: reference to a Candidate.
+      candidate: who plays.
       seeds: one episode is played per seed.
       max_calls: most calls to start.
 
@@ -91,20 +93,21 @@ def evaluate_in_parallel(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: lis
     num_calls = min(max_calls, len(seeds))
     bounds = [len(seeds) * i // num_calls for i in range(num_calls + 1)] if num_calls else []
     chunks = [seeds[begin:end] for begin, end in pairwise(bounds)]
-    refs = [calls.run(evaluate, spec, candidate, chunk) for chunk in chunks]
+    refs = [calls.run(evaluate, spec, by_reference(candidate), chunk) for chunk in chunks]
     return join_stats([_get_result(calls, spec, candidate, *call) for call in zip(chunks, refs, strict=True)])
 
 
-def _get_result(calls: Calls, spec: EnvSpec, candidate: Ref, seeds: list[int], ref: Ref) -> EpisodeStats:
+def _get_result(
+    calls: Calls, spec: EnvSpec, candidate: Ref[Candidate], seeds: list[int], ref: Ref[EpisodeStats]
+) -> EpisodeStats:
     """Waits for a call of `evaluate`, and makes it again as long as the decision table says so."""
     for attempt in count(1):
         try:
-            stats: EpisodeStats = calls.get(ref)
-            return stats
+            return calls.get(ref)
         except CallFailed as failure:
             if decide(ComponentKind.EVALUATOR, failure.fault, attempt, 0.0) is Action.STOP:
                 raise
-            ref = calls.run(evaluate, spec, candidate, seeds)
+            ref = calls.run(evaluate, spec, by_reference(candidate), seeds)
     raise AssertionError("count never ends")
 
 

@@ -1,6 +1,6 @@
-"""What runs in a process of its own, or with the learner: a replay shard with its replies.
+"""The node of a replay shard: it stores blocks, hands out newer weights in its replies, and draws samples.
 
-A plain class, so that the same code runs in one process and as a Ray actor.
+A plain class, which runs in the learner's process or as a Ray actor.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from actors.storage.malloc import limit_fragmentation
 from actors.storage.uri import Location, fetched
 
 REMEMBERED_BLOCKS = 8
-"""Blocks of a worker that a shard knows one by one; more than may be under way at once."""
+"""Newest blocks of a worker that a shard knows one by one; more than can be in flight at once."""
 
 
 class ShardSettings(NamedTuple):
-    """What a replay shard needs to know of the run; without `priorities` it draws uniformly."""
+    """A replay shard's settings; without `priorities` it draws uniformly."""
 
     dtype: np.dtype[Any]
     capacity: int
@@ -41,10 +41,10 @@ def make_shard(settings: ShardSettings) -> ReplayShard:
 
 
 class ShardNode:
-    """A replay shard that tells every worker of newer weights."""
+    """A replay shard whose replies carry newer weights to the workers; implements `actors.rollout.node.PushTarget`."""
 
     def __init__(self, settings: ShardSettings) -> None:
-        limit_fragmentation()  # blocks come and go here
+        limit_fragmentation()  # blocks are allocated and freed here all the time
         self.shard = make_shard(settings)
         self._writer = FragmentWriter()
         self._weights: WeightsSnapshot | None = None
@@ -52,7 +52,7 @@ class ShardNode:
         self._delivered: dict[int, tuple[int, Delivered]] = {}
 
     def publish(self, weights: WeightsSnapshot) -> None:
-        """Hands out these weights from now on, in the replies themselves: a reference would cost a round trip more."""
+        """Hands out these weights from now on, by value: a reference would cost the worker one more round trip."""
         self._weights = weights
 
     def add(self, block: TransitionBlock) -> AddReply:
@@ -63,12 +63,12 @@ class ShardNode:
         outdated = stored.duplicate and (header.incarnation, header.sequence) not in known
         if not stored.duplicate:
             known.append((header.incarnation, header.sequence))
-            self._note_delivery(block)
+            self._record_delivery(block)
         version = -1 if self._weights is None else self._weights.version
         newer = self._weights if version > header.policy_version else None
         return AddReply(stored.rows, stored.duplicate, version, newer, outdated)
 
-    def _note_delivery(self, block: TransitionBlock) -> None:
+    def _record_delivery(self, block: TransitionBlock) -> None:
         header = block.header
         before = self._delivered_by(header.worker_id, header.incarnation)
         now = Delivered(
@@ -93,13 +93,18 @@ class ShardNode:
         return self.shard.sample(count)
 
     def set_priorities(self, numbers: NDArray[np.int64], td_errors: NDArray[np.float32]) -> float:
-        """Takes the learner's answer to `sample`, see PrioritisedShard.set_priorities; returns the mass after it."""
+        """Sets the priorities of sampled rows (see PrioritisedShard.set_priorities); returns the shard's new mass.
+
+        Args:
+          numbers: `Draws.number` of the rows, `[count]`.
+          td_errors: `[count]`.
+        """
         assert isinstance(self.shard, PrioritisedShard)
         self.shard.set_priorities(numbers, td_errors)
         return self.shard.mass
 
     def mass(self) -> float:
-        """What the shard counts among all (see ReplayShard.mass)."""
+        """The shard's weight in a draw from all shards (see ReplayShard.mass)."""
         return self.shard.mass
 
     def size(self) -> int:
@@ -107,10 +112,10 @@ class ShardNode:
         return self.shard.size
 
     def save(self, location: Location) -> dict[str, Any]:
-        """Starts to write what the shard holds now to a zarr group at `location`; `saved` tells of its end.
+        """Starts to write what the shard holds now to a zarr group at `location`; `saved` tells how that ended.
 
         Returns:
-          The state that belongs to it, for JSON.
+          The rest of its state, for JSON.
         """
         snapshot = self.shard.snapshot()
         if not self._writer.start(location, snapshot.save):
@@ -122,6 +127,6 @@ class ShardNode:
         return self._writer.result(timeout_s)
 
     def load(self, location: Location, state: dict[str, Any]) -> None:
-        """Takes up what `save` wrote and returned (see ReplayShard.load)."""
+        """Restores what `save` wrote and returned (see ReplayShard.load)."""
         with fetched(location) as path:
             self.shard.load(path, state)

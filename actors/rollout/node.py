@@ -1,14 +1,15 @@
-"""What runs in a process of its own: a rollout worker with its pushes.
+"""The node of a rollout worker: it collects blocks and pushes them to the replay shards.
 
-A plain class over `Calls`, so that the same code runs in one process and as a Ray actor. Experience goes
-from a rollout worker straight to a shard; the reply carries newer weights, if there are any.
+A plain class over `Calls`, which runs in this process or as a Ray actor. Transitions go straight from a rollout worker
+to a shard; the shard's reply carries newer weights, if there are any.
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
 
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
@@ -22,23 +23,36 @@ from actors.service.messages import (
     WAITS,
     AddReply,
     BlockReport,
+    Delivered,
     Dropped,
     TransitionBlock,
 )
-from actors.service.rpc import Calls, Node, Ref
+from actors.service.rpc import Calls, Handle, Ref
 from actors.service.stopwatch import Stopwatch
 from actors.storage.fragment_writer import FragmentWriter, WriteResult
 from actors.storage.uri import Location, fetched
 
 
+class PushTarget(Protocol):
+    """What rollout workers push to: a replay shard, or the learner with the shards that it embeds."""
+
+    def add(self, block: TransitionBlock) -> AddReply:
+        """Stores a block; the reply carries newer weights than the block's, if there are any."""
+        ...
+
+    def fence(self, worker_id: int, closed: int, incarnation: int) -> Delivered:
+        """Refuses blocks of a worker from before `incarnation` from now on; returns what was stored of `closed`."""
+        ...
+
+
 class _Push(NamedTuple):
-    """A push under way: which block to which incarnation of which shard, and the how manieth attempt it is."""
+    """A push in flight: its block, the shard and the shard's incarnation, and the attempt number, from 1."""
 
     block: TransitionBlock
     shard: int
     incarnation: int
     attempt: int
-    ref: Ref
+    ref: Ref[AddReply]
 
 
 def _report(push: _Push, reply: AddReply, dropped: Dropped | None) -> BlockReport:
@@ -59,15 +73,15 @@ def _report(push: _Push, reply: AddReply, dropped: Dropped | None) -> BlockRepor
 class RolloutNode:
     """A rollout worker that pushes its blocks to the shards in turn.
 
-    A push may still be under way while the next block is collected; a block is reported once it is stored.
+    Pushes may be in flight while the next block is collected; a block is reported once it is stored.
 
     Args:
       settings: see RolloutSettings.
-      worker_id: position among the workers; also the first shard that is pushed to.
+      worker_id: position among the workers; the first push goes to the shard `worker_id` modulo their number.
       incarnation: how often this worker was started before.
       calls: how to call the shards.
-      shards: nodes with `add`.
-      pushes_in_flight: pushes that may be under way when `collect` returns.
+      shards: where to push to.
+      pushes_in_flight: most pushes that are in flight when `collect` returns.
     """
 
     def __init__(
@@ -76,7 +90,7 @@ class RolloutNode:
         worker_id: int,
         incarnation: int,
         calls: Calls,
-        shards: list[Node],
+        shards: Sequence[Handle[PushTarget]],
         pushes_in_flight: int,
     ) -> None:
         self._worker = RolloutWorker(settings, worker_id, incarnation)
@@ -89,22 +103,22 @@ class RolloutNode:
         self._pushes: deque[_Push] = deque()
         self._watch = Stopwatch()
 
-    def replace_shard(self, index: int, shard: Node, incarnation: int) -> None:
-        """Pushes to `shard` from now on where it pushed to the shard of this index."""
+    def replace_shard(self, index: int, shard: Handle[PushTarget], incarnation: int) -> None:
+        """Pushes to `shard`, of this incarnation, in place of the shard of this index."""
         self._shards[index], self._shard_incarnations[index] = shard, incarnation
 
     def set_weights(self, weights: WeightsSnapshot) -> None:
-        """Acts with these weights."""
+        """Acts with these weights from the next block on."""
         self._worker.set_weights(weights)
 
     def collect(self, rate: float) -> list[BlockReport]:
         """Collects one block with exploration rate `rate` and pushes it.
 
         Returns:
-          Reports of the blocks that were stored, or dropped, meanwhile.
+          Reports of the blocks that have been stored or dropped since the last report.
 
         Raises:
-          CallFailed: it never got weights, for they were lost on their way.
+          CallFailed: no weights have arrived; they were lost on the way.
         """
         if self._worker.policy_version < 0:
             raise CallFailed(Fault.OBJECT_LOST, "it has no weights")
@@ -121,11 +135,11 @@ class RolloutNode:
         return reports
 
     def _push(self, block: TransitionBlock, shard: int, attempt: int) -> _Push:
-        ref = self._calls.start(self._shards[shard], "add", block)
+        ref = self._calls.start(self._shards[shard], PushTarget.add, block)
         return _Push(block, shard, self._shard_incarnations[shard], attempt, ref)
 
     def settle(self) -> list[BlockReport]:
-        """Waits for every push under way; returns their reports."""
+        """Waits for every push in flight; returns their reports."""
         self._watch.lap(WAITS)
         reports = self._confirm(0)
         self._watch.lap(STORES)
@@ -134,14 +148,14 @@ class RolloutNode:
     def _confirm(self, limit: int) -> list[BlockReport]:
         reports = []
         while len(self._pushes) > limit:
-            reports.append(self._settled(self._pushes.popleft()))
+            reports.append(self._completed(self._pushes.popleft()))
         return reports
 
-    def _settled(self, push: _Push) -> BlockReport:
-        """Waits for a push, which is tried again where that is harmless: the shard knows the blocks it has."""
+    def _completed(self, push: _Push) -> BlockReport:
+        """Waits for a push and retries it where the fault allows that: the shard recognises duplicates."""
         while True:
             try:
-                reply: AddReply = self._calls.get(push.ref)
+                reply = self._calls.get(push.ref)
             except CallFailed as failure:
                 if decide(ComponentKind.SHARD, failure.fault, push.attempt, 0.0) is not Action.RETRY:
                     return _report(push, AddReply(0, False, -1, None), Dropped.SHARD_LOST)._replace(fault=failure.fault)
@@ -150,7 +164,7 @@ class RolloutNode:
             self._take_weights(reply)
             if not reply.duplicate:
                 return _report(push, reply, None)
-            if push.attempt > 1 and not reply.outdated:  # an attempt before had stored it
+            if push.attempt > 1 and not reply.outdated:  # an earlier attempt stored it
                 return _report(push, reply._replace(stored=push.block.transitions), None)
             return _report(push, reply, Dropped.OUTDATED if reply.outdated else Dropped.DUPLICATE)
 
@@ -159,16 +173,16 @@ class RolloutNode:
             self._worker.set_weights(reply.weights)
 
     def save(self, location: Location) -> dict[str, Any]:
-        """Starts to write the worker's arrays as they are now to the file `location`; `saved` tells of its end.
+        """Starts to write the worker's arrays, as they are now, to the file `location`; `saved` tells how that ended.
 
         Returns:
           The rest of its state, for JSON.
 
         Raises:
-          RuntimeError: pushes are under way.
+          RuntimeError: pushes are in flight.
         """
         if self._pushes:
-            raise RuntimeError("settle before the state is saved: pushes are under way")
+            raise RuntimeError("pushes are in flight; settle before the state is saved")
         state = self._worker.get_state()
         self._writer.start(location, lambda path: save_file(state["arrays"], str(path)))
         return {**state["meta"], "next_shard": self._next_shard}
@@ -178,10 +192,10 @@ class RolloutNode:
         return self._writer.result(timeout_s)
 
     def load(self, location: Location, state: dict[str, Any]) -> None:
-        """Takes up what `save` wrote and returned.
+        """Restores what `save` wrote and returned.
 
         Raises:
-          ValueError: the file is damaged or does not fit.
+          ValueError: the file is damaged or does not fit this worker.
         """
         try:
             with fetched(location) as path:

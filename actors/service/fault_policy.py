@@ -78,6 +78,11 @@ class CallFailed(Exception):
         self.fault = fault
         self.reason = reason
 
+    def of(self, component: Component, incarnation: int, method: str = "") -> ComponentFailed:
+        """The failure of this call as one of the component that was called; the reason names `method`, if given."""
+        reason = f"{method}: {self.reason}" if method else self.reason
+        return ComponentFailed(component, incarnation, self.fault, reason)
+
 
 def first_line(error: BaseException) -> str:
     """First line of an error's message; the name of its type if the message is empty."""

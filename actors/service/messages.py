@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from actors.service.fault_policy import Fault
 from actors.service.packing import Packed
+
+if TYPE_CHECKING:
+    from actors.policy.network import WeightsSnapshot  # imports torch, which messages do without
 
 SCHEMA_VERSION = 3
 """Version of the block layout; a shard refuses any other."""
@@ -64,14 +67,14 @@ class AddReply(NamedTuple):
     """A shard's reply to a push.
 
     Fields: transitions stored; whether the block was refused as a duplicate; version of the shard's weights; these
-    weights (a WeightsSnapshot), or None if they are no newer than the block's; whether a refused block was never stored
-    because its worker has been replaced or a later block arrived first.
+    weights, or None if they are no newer than the block's; whether a refused block was never stored because its worker
+    has been replaced or a later block arrived first.
     """
 
     stored: int
     duplicate: bool
     weights_version: int
-    weights: Any
+    weights: WeightsSnapshot | None
     outdated: bool = False
 
 

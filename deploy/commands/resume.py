@@ -26,7 +26,7 @@ def run(command: Resume) -> int:
         config = dataclasses.replace(config, device=command.device or config.device)
         tracker = open_tracker(folder.identity())
         print_resume_point(checkpoint, skipped)
-        return resume_training(folder, config, tracker, checkpoint, command.place())
+        return resume_training(folder, config, tracker, checkpoint, command.cluster_options())
 
 
 def _extended(config: RunConfig, total_env_steps: int | None, done: int) -> RunConfig:

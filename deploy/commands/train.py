@@ -19,8 +19,8 @@ from deploy.runs.folders import (
 )
 from deploy.training import check_device, open_tracker, print_resume_point, resume_training, run_training
 from learner.checkpoints.checkpoint import finished_names
+from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig, config_hash
-from learner.placement import Place
 from learner.run import resume_point
 from learner.run_folder import RunFolder, RunIdentity
 from learner.tracking.mlflow_run import Tracker
@@ -47,7 +47,7 @@ def run(command: Train) -> int:
     if folder.has_begun():
         with folder.hold():
             _check_storage(folder, command.checkpoint_url)
-            return _resume(folder, config, launch.place())
+            return _resume(folder, config, launch.cluster_options())
     make_folder(launch.runs_dir, "--runs-dir")
     if launch.ray_address() is None:
         check_fits(config)
@@ -61,7 +61,7 @@ def run(command: Train) -> int:
         folder.save_storage(storage)
         folder.save_config(config)
         folder.save_identity(RunIdentity(config.name, public_uri(tracker.uri), launch.experiment, tracker.run_id))
-        return run_training(folder, config, tracker, None, launch.place())
+        return run_training(folder, config, tracker, None, launch.cluster_options())
 
 
 def _run_folder(config: RunConfig, launch: Launch, or_resume: bool) -> RunFolder:
@@ -85,7 +85,7 @@ def _check_storage(folder: RunFolder, checkpoint_url: str | None) -> None:
         )
 
 
-def _resume(folder: RunFolder, config: RunConfig, place: Place) -> int:
+def _resume(folder: RunFolder, config: RunConfig, options: ClusterOptions) -> int:
     """Resumes an unfinished run from its newest checkpoint, or from its start; returns the exit code."""
     known = folder.config()
     require(
@@ -101,4 +101,4 @@ def _resume(folder: RunFolder, config: RunConfig, place: Place) -> int:
     if finished_names(folder.checkpoint_location()):
         checkpoint, skipped = resume_point(folder, config)
         print_resume_point(checkpoint, skipped)
-    return resume_training(folder, config, tracker, checkpoint, place)
+    return resume_training(folder, config, tracker, checkpoint, options)

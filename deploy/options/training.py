@@ -9,8 +9,8 @@ from typing import Literal
 
 from tyro.conf import Fixed, Positional, Suppress
 
+from learner.cluster_options import DEADLINE_S, START_DEADLINE_S, ClusterOptions
 from learner.config import RunConfig
-from learner.placement import DEADLINE_S, START_DEADLINE_S, Place
 from learner.presets import PresetName
 from learner.sweep.grid import SweepConfig
 from sim_core.checks import require
@@ -40,9 +40,9 @@ class RayOptions:
         """The Ray cluster to join; None starts a Ray on this machine."""
         return ray_address(self.address)
 
-    def place(self) -> Place:
+    def cluster_options(self) -> ClusterOptions:
         """Where the components run, and their deadlines."""
-        return Place(self.ray_address(), self.deadline_s, self.start_deadline_s)
+        return ClusterOptions(self.ray_address(), self.deadline_s, self.start_deadline_s)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,1 +1,1 @@
-"""The one place that knows Ray (sweeps use Ray Tune beside it)."""
+"""The package that knows Ray; besides it, sweeps use Ray Tune, and `deploy` submits Ray jobs."""

@@ -1,9 +1,9 @@
-"""Who may speak to the Ray that a process starts or joins: tokens, and the loopback interface.
+"""Access to the Ray that a process starts or joins: token authentication, and the loopback interface.
 
-Ray decides by environment variables that it reads when it is imported. A Ray of our own listens on loopback alone and
-asks for a token that only this process and its children have: neither the network nor another user of the machine can
-make it run code. For a cluster that is joined, `ray start` asks for a token if its user has one, and so do we: a
-process that asked for a token and has none would be refused before it has spoken to anybody.
+Ray is configured by environment variables, which it reads when it is imported. A Ray that this process starts listens
+on loopback alone and requires a token that only this process and its children hold, so neither the network nor another
+user of the machine can make it run code. When a cluster is joined, tokens are used if the user has one, as `ray start`
+does: a process that turns authentication on without a token cannot connect to any cluster.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from sim_core.checks import require
 MODE = "RAY_AUTH_MODE"
 TOKEN = "RAY_AUTH_TOKEN"
 REMOTE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
-"""Whether Ray takes an address that others can reach, on any system in spite of its name; "0" is loopback alone."""
-HOW = (
+"""Whether Ray listens on an address that others can reach, on any system despite its name; "0" is loopback alone."""
+TOKEN_HELP = (
     "set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH to the cluster's token "
     "(`ray get-auth-token` prints it there)"
 )
@@ -33,20 +33,20 @@ def has_token() -> bool:
 
 
 def guard_ray(joins: bool) -> None:
-    """Sets what of these variables is not set; before Ray is imported.
+    """Sets those of the variables that are unset; call it before Ray is imported.
 
     Args:
-      joins: whether a cluster is joined that others can reach, rather than a Ray of our own started.
+      joins: whether a cluster is joined, rather than Ray started by this process.
 
     Raises:
-      ConfigError: a Ray of our own could not be guarded, as Ray has been imported and nothing is set.
+      ConfigError: Ray is to be started, but it has been imported while the variables were unset.
     """
     if joins:
         os.environ.setdefault(MODE, "token" if has_token() else "disabled")
         return
     require(
         MODE in os.environ or "ray" not in sys.modules,
-        "Ray was imported before it was decided who may speak to it; call learner.ray_backend.auth.guard_ray first, "
+        "Ray was imported before its authentication was configured; call learner.ray_backend.auth.guard_ray first, "
         f"or set {MODE} and {TOKEN}",
     )
     os.environ.setdefault(REMOTE, "0")

@@ -1,7 +1,7 @@
-"""The module that knows Ray (sweeps have `tune_edge`): it places the plain classes as Ray actors and calls them.
+"""Places the nodes of a run as Ray actors and calls them; translates Ray's errors into faults.
 
-Rollout workers push to the shards themselves; the driver holds references and small reports only. The
-embedded shards live in the learner's actor; with `replay_placement = "actors"` each has its own.
+Rollout workers push to the shards themselves; the driver holds references and small reports only. The shards are
+embedded in the learner's actor, or with `replay_placement = "actors"` each is an actor of its own.
 """
 
 from __future__ import annotations
@@ -10,11 +10,10 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar, TypeVarTuple
 
 import psutil
 import ray
-from ray.actor import ActorHandle
 from ray.exceptions import (
     ActorUnavailableError,
     AuthenticationError,
@@ -35,40 +34,51 @@ from actors.rollout.node import RolloutNode
 from actors.rollout.vector_env import EnvSpec, env_shape
 from actors.service.fault_policy import CallFailed, ComponentFailed, Fault, first_line
 from actors.service.messages import EpisodeStats
-from actors.service.rpc import LocalCalls, Node, Ref
+from actors.service.rpc import Handle, LocalCalls, Ref, local_handle
+from learner.cluster_options import DEADLINE_S, ClusterOptions
 from learner.config import RunConfig
-from learner.placement import DEADLINE_S, Place
-from learner.ray_backend.auth import HOW, guard_ray
-from learner.training.cluster import Cluster, learner_settings, rollout_settings, shard_settings
+from learner.ray_backend.auth import TOKEN_HELP, guard_ray
+from learner.training.cluster import (
+    Cluster,
+    Limits,
+    rollout_settings,
+    shard_settings,
+)
 from learner.update.learner_node import LearnerNode
 from sim_core.checks import ConfigError, require
 
+N = TypeVar("N")
+T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
+
 PUSHES_IN_FLIGHT = 2
-"""Pushes of a worker that may be under way while it collects: shards that live with the learner wait for updates."""
+"""Pushes that a worker may have in flight while it collects: embedded shards answer only between calls of updates."""
 COLLECTS_IN_FLIGHT = 2
-"""Collects of a worker that are started ahead, so that it never waits for the driver."""
+"""Collects that a worker may have in flight, so that it never waits for the driver."""
 UPDATES_IN_FLIGHT = 2
-"""Calls of updates that are started ahead, so that the learner never waits for the driver."""
+"""Calls of updates that the learner may have in flight, so that it never waits for the driver."""
 INNER_SHARE = 0.3
-"""Share of the deadline that parts give each other, so that one that waits, twice in a row, is not itself late."""
+"""Share of the deadline that nodes give each other, so that a node that waits twice in a row is not itself late."""
 RAYLET = "raylet"
-"""Name of the process that a Ray of our own starts its workers from."""
+"""Name of the process from which a local Ray starts its workers."""
 FAULTS: tuple[tuple[tuple[type[Exception], ...], Fault], ...] = (
     ((ActorUnavailableError,), Fault.UNREACHABLE),
     ((RayActorError, WorkerCrashedError, NodeDiedError, OutOfMemoryError, TaskCancelledError), Fault.DIED),
     ((ObjectLostError,), Fault.OBJECT_LOST),
     ((GetTimeoutError,), Fault.LATE),
 )
-"""What errors of Ray mean; the first match counts."""
-OWN_RAY = {
+"""The fault that each error of Ray stands for; the first match counts."""
+LOCAL_RAY = {
     "idle_worker_killing_time_threshold_ms": 24 * 3_600_000,
     "task_events_report_interval_ms": 0,
     "max_direct_call_object_size": 2**20,
 }
-"""Settings of a Ray of our own. It keeps processes that wait for tasks: evaluations are tasks beside actors that take
-all CPU slots, and Ray would end their process after a second and start the next one from nothing. It keeps no list of
-the last 100,000 calls, 300 MB that only its dashboard would show, and there is none. And it sends blocks of up to a
-MiB in the call itself; past its own 100 KiB they would go through the object store, which costs several calls more."""
+"""Settings of a Ray that this process starts, each against a default that costs a run time or memory.
+
+Idle worker processes are kept: an evaluation is a task beside actors that take all CPU slots, and Ray would kill its
+process after a second and start the next one from nothing. The last 100,000 calls are not recorded: that takes 300 MB,
+and only Ray's dashboard shows them. Blocks of up to 1 MiB travel in the call itself: above Ray's default of 100 KiB
+they would go through the object store, which costs several more calls."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
@@ -78,7 +88,7 @@ def _task(function: Callable[..., Any]) -> Any:
 
 
 def _as_fault(error: Exception) -> Exception:
-    """What an error of Ray means; what our own code raised stays as it is."""
+    """The fault that an error of Ray stands for; an error that our own code raised, unchanged."""
     if isinstance(error, RayTaskError):
         cause = getattr(error, "cause", None)
         if isinstance(cause, CallFailed | ComponentFailed):
@@ -94,34 +104,37 @@ class RayCalls:
     """Calls of Ray actors; implements `actors.service.rpc.Calls`.
 
     Args:
-      deadline_s: `get` waits no longer.
+      deadline_s: most time that `get` waits.
     """
 
     def __init__(self, deadline_s: float) -> None:
         self._deadline_s = deadline_s
 
-    def start(self, node: Node, method: str, *args: Any) -> Ref:
+    def start(self, node: Handle[N], method: Callable[[N, *Ts], T], *args: *Ts) -> Ref[T]:
         """Starts an actor's method."""
-        return getattr(node, method).remote(*args)
+        ref: Ref[T] = getattr(node, method.__name__).remote(*args)
+        return ref
 
-    def run(self, function: Callable[..., Any], *args: Any) -> Ref:
-        """Starts a function as a Ray task; it takes no CPU slot, so that it never waits for the run's own actors."""
-        return _task(function).remote(*args)
+    def run(self, function: Callable[[*Ts], T], *args: *Ts) -> Ref[T]:
+        """Starts a function as a Ray task, which takes no CPU slot: the run's actors may hold them all."""
+        ref: Ref[T] = _task(function).remote(*args)
+        return ref
 
-    def wait(self, refs: list[Ref], timeout_s: float) -> list[Ref]:
-        """Blocks until one of `refs` is there or the time is over; returns all that are, in the given order."""
+    def wait(self, refs: list[Ref[T]], timeout_s: float) -> list[Ref[T]]:
+        """Blocks until one of `refs` is there or the time is over; returns those that are there, in the given order."""
         ray.wait(refs, num_returns=1, timeout=timeout_s, fetch_local=False)
         ready, _ = ray.wait(refs, num_returns=len(refs), timeout=0, fetch_local=False)
         return [ref for ref in refs if ref in set(ready)]
 
-    def get(self, ref: Ref) -> Any:
+    def get(self, ref: Ref[T]) -> T:
         """The result behind `ref`.
 
         Raises:
           CallFailed: the call could not be made, its result is gone, or the deadline passed.
         """
         try:
-            return ray.get(ref, timeout=self._deadline_s)
+            result: T = ray.get(ref, timeout=self._deadline_s)
+            return result
         except GetTimeoutError as error:
             raise CallFailed(Fault.LATE, f"no answer within {self._deadline_s:.0f} s") from error
         except RayError as error:
@@ -130,44 +143,46 @@ class RayCalls:
                 raise
             raise fault from error
 
-    def put(self, value: Any) -> Ref:
+    def put(self, value: T) -> Ref[T]:
         """Puts a value into the object store."""
-        return ray.put(value)
-
-
-def _make_learner(config: RunConfig, shards: list[Node], calls: RayCalls) -> LearnerNode:
-    """Builds the learner in its actor; without shard actors, its shards too."""
-    shape = env_shape(config.env)
-    settings = learner_settings(config, shape)
-    if shards:
-        return LearnerNode(settings, shards, calls, draws_ahead=config.replay == "uniform")
-    embedded: list[Node] = [ShardNode(settings) for settings in shard_settings(config, shape)]
-    return LearnerNode(settings, embedded, LocalCalls())
+        ref: Ref[T] = ray.put(value)
+        return ref
 
 
 class LearnerActor(LearnerNode):
-    """LearnerNode built from the config, so that no large constructor argument breaks a restart."""
+    """The learner's actor, which embeds the shards if they have no actors of their own.
 
-    def __init__(self, config: RunConfig, shards: list[Node], calls: RayCalls) -> None:
-        self.__dict__ = _make_learner(config, shards, calls).__dict__
+    Args:
+      config: the run.
+      shards: actors of the shards, or none.
+      calls: how to call them.
+    """
+
+    def __init__(self, config: RunConfig, shards: list[Handle[ShardNode]], calls: RayCalls) -> None:
+        shape = env_shape(config.env)
+        if shards:
+            super().__init__(config, shape, shards, calls, prefetch=config.replay == "uniform")
+        else:
+            embedded = [local_handle(ShardNode(shard)) for shard in shard_settings(config, shape)]
+            super().__init__(config, shape, embedded, LocalCalls())
 
 
 def cpus_needed(config: RunConfig) -> int:
-    """CPU slots that the run's actors take: one a rollout worker, shard actor and learner."""
+    """CPU slots that the run's actors take: one each for a rollout worker, a shard actor and the learner."""
     shards = config.replay_shards if config.replay_placement == "actors" else 0
     return config.workers + shards + 1
 
 
 def cluster_cpus() -> int:
-    """CPU slots of the cluster that this process has joined."""
+    """CPU slots of the Ray cluster that this process has joined."""
     return int(ray.cluster_resources().get("CPU", 0))
 
 
 def learner_gpus(config: RunConfig) -> int:
-    """GPUs to keep for the learner in the cluster that this process has joined.
+    """GPUs to reserve for the learner in the Ray cluster that this process has joined: 0 or 1.
 
     Raises:
-      ConfigError: the config wants CUDA, and the cluster has no GPU.
+      ConfigError: the config asks for CUDA, and the cluster has no GPU.
     """
     if config.device == "cpu":
         return 0
@@ -178,25 +193,26 @@ def learner_gpus(config: RunConfig) -> int:
 
 
 def connect(cpus: int, address: str | None) -> None:
-    """Joins the cluster at `address`, or starts Ray on this machine with room for `cpus` CPU slots.
+    """Joins the Ray cluster at `address`; if it is None, starts Ray on this machine with at least `cpus` CPU slots.
 
     Raises:
-      ConfigError: the cluster cannot be reached, wants another token, or has too few CPUs.
+      ConfigError: the cluster cannot be reached, refuses the token, or has too few CPUs.
     """
     if ray.is_initialized():
-        return  # an earlier attempt of this run has joined
+        return  # by an earlier attempt of this run
     guard_ray(address is not None)
-    os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # of calls to parts that have been replaced
+    os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # from calls of nodes that have been replaced
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     options: dict[str, Any] = {"address": address}
     if address is None:
         options = {"address": "local", "include_dashboard": False, "num_cpus": max(cpus, os.cpu_count() or 1)}
-        options["_system_config"] = OWN_RAY
+        options["_system_config"] = LOCAL_RAY
     try:
         ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
     except (ConnectionError, AuthenticationError) as error:
         raise ConfigError(
-            f"no Ray cluster answers at {address!r}; start one with `ray start --head`, or for one with tokens {HOW}"
+            f"no Ray cluster answers at {address!r}; start one with `ray start --head`, "
+            f"or for one with tokens {TOKEN_HELP}"
         ) from error
     have = cluster_cpus()
     if have < cpus:
@@ -208,23 +224,24 @@ def connect(cpus: int, address: str | None) -> None:
 
 
 def leave() -> None:
-    """Leaves the cluster; a Ray of our own ends with all of its processes.
+    """Leaves the Ray cluster; a Ray that this process started ends with all of its processes.
 
-    A worker of Ray may hang for good in its own end, after its raylet has gone, and Ray looks after it no more.
+    A worker process may hang for good while it exits after its raylet has gone, when Ray no longer looks after it. So
+    all of them are killed.
     """
     raylets = [child for child in psutil.Process().children() if child.name() == RAYLET]
-    family = [process for raylet in raylets for process in raylet.children(recursive=True)]
+    workers = [process for raylet in raylets for process in raylet.children(recursive=True)]
     ray.shutdown()
-    for process in family:
+    for process in workers:
         with suppress(psutil.NoSuchProcess):
             process.kill()
 
 
 def evaluate_in_tasks(spec: EnvSpec, candidate: Candidate, seeds: list[int], address: str | None) -> EpisodeStats:
-    """Plays one episode a seed in Ray tasks on all CPUs (see `connect` for errors).
+    """Plays one episode per seed in Ray tasks on all CPUs (see `connect` for errors).
 
     Returns:
-      One entry a seed, in order.
+      One entry per seed, in order.
     """
     connect(1, address)
     calls = RayCalls(DEADLINE_S)
@@ -234,59 +251,67 @@ def evaluate_in_tasks(spec: EnvSpec, candidate: Candidate, seeds: list[int], add
         leave()
 
 
-def ray_cluster(config: RunConfig, incarnation: int, place: Place) -> Cluster:
-    """Places the run's parts as Ray actors (see `connect` for errors)."""
-    connect(cpus_needed(config), place.address)
-    inner = RayCalls(place.deadline_s * INNER_SHARE)
-    shape = env_shape(config.env)
-    own = config.replay_placement == "actors"
+class RayCluster(Cluster):
+    """The nodes of a run as Ray actors.
 
-    def place_shard(index: int, incarnation: int) -> Node:
-        return _actor(ShardNode).remote(shard_settings(config, shape, incarnation)[index])
+    Args:
+      config: the run.
+      incarnation: see Cluster.
+      options: the cluster's address, and deadlines.
 
-    shards = [place_shard(index, 0) for index in range(config.replay_shards)] if own else []
-    learner = _actor(LearnerActor, learner_gpus(config)).remote(config, shards, inner)
-    targets = shards or [learner]
+    Raises:
+      ConfigError: see `connect` and `learner_gpus`.
+    """
 
-    def place_worker(worker_id: int, incarnation: int) -> Node:
-        settings = rollout_settings(config)
-        return _actor(RolloutNode).remote(settings, worker_id, incarnation, inner, targets, PUSHES_IN_FLIGHT)
+    def __init__(self, config: RunConfig, incarnation: int, options: ClusterOptions) -> None:
+        connect(cpus_needed(config), options.address)
+        self._shape = env_shape(config.env)
+        self._node_calls = RayCalls(options.deadline_s * INNER_SHARE)
+        limits = Limits(
+            deadline_s=options.deadline_s,
+            start_deadline_s=options.start_deadline_s,
+            collects_in_flight=COLLECTS_IN_FLIGHT,
+            blocks_in_flight=config.workers * (COLLECTS_IN_FLIGHT + PUSHES_IN_FLIGHT),
+            updates_in_flight=UPDATES_IN_FLIGHT,
+            eval_tasks=cluster_cpus(),
+        )
+        calls = RayCalls(max(options.deadline_s, options.start_deadline_s))
+        super().__init__(config, incarnation, calls, limits)
 
-    workers = [place_worker(worker_id, incarnation) for worker_id in range(config.workers)]
+    def place_learner(self) -> Handle[LearnerNode]:
+        """Starts the learner's actor, which embeds the shards if they have no actors of their own."""
+        return _start_actor(LearnerActor, learner_gpus(self.config), self.config, self.shards, self._node_calls)
 
-    def abandon() -> None:
-        for node in {*targets, learner, *workers}:
-            _discard(node)
+    def place_worker(self, worker_id: int, incarnation: int) -> Handle[RolloutNode]:
+        """Starts the actor of a rollout worker."""
+        settings = rollout_settings(self.config)
+        arguments = (settings, worker_id, incarnation, self._node_calls, self.targets, PUSHES_IN_FLIGHT)
+        return _start_actor(RolloutNode, 0, *arguments)
 
-    return Cluster(
-        calls=RayCalls(max(place.deadline_s, place.start_deadline_s)),
-        incarnation=incarnation,
-        learner=learner,
-        workers=workers,
-        targets=targets,
-        shards_are_parts=own,
-        place_worker=place_worker,
-        place_shard=place_shard,
-        discard=_discard,
-        deadline_s=place.deadline_s,
-        start_deadline_s=place.start_deadline_s,
-        collects_in_flight=COLLECTS_IN_FLIGHT,
-        blocks_in_flight=config.workers * (COLLECTS_IN_FLIGHT + PUSHES_IN_FLIGHT),
-        updates_in_flight=UPDATES_IN_FLIGHT,
-        eval_tasks=cluster_cpus(),
-        abandon=abandon,
-        close=leave,
-    )
+    def place_shard(self, index: int, incarnation: int) -> Handle[ShardNode]:
+        """Starts the actor of an empty shard."""
+        return _start_actor(ShardNode, 0, shard_settings(self.config, self._shape, incarnation)[index])
 
+    def discard(self, node: Handle[Any]) -> None:
+        """Kills an actor."""
+        ray.kill(node)
 
-def _actor(kind: type, gpus: int = 0) -> Any:
-    """`kind` as a Ray actor; no restarts by Ray itself, which would not know the incarnation."""
-    return ray.remote(num_cpus=1, num_gpus=gpus, max_restarts=0, max_task_retries=0)(kind)
+    def cancel(self, ref: Ref[Any]) -> None:
+        """Cancels a task; Ray kills its process if it does not end by itself."""
+        ray.cancel(ref, force=True)
+
+    def abandon(self) -> None:
+        """Kills all actors."""
+        for node in (*self.shards, self.learner, *self.workers):
+            ray.kill(node)
+
+    def close(self) -> None:
+        """Leaves the cluster (see `leave`)."""
+        leave()
 
 
-def _discard(what: Any) -> None:
-    """Ends an actor, or a call that nobody waits for any more. Ray kills a process that does not go by itself."""
-    if isinstance(what, ActorHandle):
-        ray.kill(what)
-    else:
-        ray.cancel(what, force=True)
+def _start_actor(kind: Callable[[*Ts], N], gpus: int, *args: *Ts) -> Handle[N]:
+    """Starts `kind(*args)` as a Ray actor; Ray must not restart it, since it does not know the incarnation."""
+    actor = ray.remote(num_cpus=1, num_gpus=gpus, max_restarts=0, max_task_retries=0)(kind)
+    handle: Handle[N] = actor.remote(*args)
+    return handle

@@ -1,4 +1,4 @@
-"""A run's rows as Ray metrics, which every node offers to Prometheus; names and meanings are in `metric_names`."""
+"""Rows of a run as Ray metrics, which each machine of a cluster exports to Prometheus; `metric_names` explains them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from learner.tracking.journal import Row
 from learner.tracking.metric_names import ENV_STEPS, METRICS, Exported
 
 RUN = "run"
-"""The label that tells runs apart."""
+"""The label that distinguishes runs."""
 
 
 class RayMetrics:
-    """Shows the newest values of a run; needs a Ray that this process has joined.
+    """Exports the newest values of a run; this process must have joined a Ray cluster.
 
     Args:
-      run: the run's name, a label of every metric.
+      run: name of the run, a label of every metric.
     """
 
     def __init__(self, run: str) -> None:
@@ -28,7 +28,7 @@ class RayMetrics:
         self._newest: dict[str, float] = {}
 
     def row(self, row: Row) -> None:
-        """Shows a row, and what earlier ones measured: Ray forgets a gauge that is not set for two of its reports."""
+        """Exports a row and the newest values of earlier rows: Ray drops a gauge that misses two of its reports."""
         self._newest |= row.metrics | {ENV_STEPS: row.env_steps}
         for name, gauge in self._gauges.items():
             value = self._newest.get(name, math.nan)

@@ -39,9 +39,10 @@ class FaultLog:
         """Notes a failure and the decision about it."""
         self._append("failed", str(failure.component), failure.fault, decision.action, decision.attempts, 0.0)
 
-    def mended(self, mended: Recovered) -> None:
-        """Notes that a part works again."""
-        self._append("mended", str(mended.component), mended.fault, mended.action, mended.attempts, mended.seconds)
+    def recovered(self, recovered: Recovered) -> None:
+        """Notes that a component works again; the event's name on disk is `mended`."""
+        component, fault, action, attempts, seconds = recovered
+        self._append("mended", str(component), fault, action, attempts, seconds)
 
     def resumed(self) -> None:
         """Notes that another driver goes on with the run."""

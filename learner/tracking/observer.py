@@ -72,7 +72,7 @@ class MirroringObserver:
         self._faults.failed(failure, decision)
         self._display.message(f"{failure}: {decision.action}")
 
-    def mended(self, mended: Recovered) -> None:
-        """Logs and shows that a part works again."""
-        self._faults.mended(mended)
-        self._display.message(f"{mended.component} works again after {mended.seconds:.1f} s")
+    def recovered(self, recovered: Recovered) -> None:
+        """Logs and shows that a component works again."""
+        self._faults.recovered(recovered)
+        self._display.message(f"{recovered.component} works again after {recovered.seconds:.1f} s")

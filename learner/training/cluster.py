@@ -1,89 +1,31 @@
-"""The parts of a run and how to call them; here all in one process, in `ray_edge` as Ray actors."""
+"""The nodes of a run and how to place them; here all in this process, in `learner.ray_backend` as Ray actors."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from actors.replay.node import ShardNode, ShardSettings
 from actors.replay.prioritised import PrioritySettings
-from actors.rollout.node import RolloutNode
+from actors.rollout.node import PushTarget, RolloutNode
 from actors.rollout.vector_env import EnvShape, env_shape
 from actors.rollout.worker import RolloutSettings
 from actors.service.messages import transition_dtype
-from actors.service.rpc import Calls, LocalCalls, Node
+from actors.service.rpc import Calls, Handle, LocalCalls, Ref, local_handle
+from learner.checkpoints.writer import Checkpointable
 from learner.config import RunConfig
 from learner.update.learner_node import LearnerNode
-from learner.update.updates import LearnerSettings
 
 LAST_WRITE_S = 60.0
-"""How long parts of this process may go on writing after an error; a disk that hangs must not hide it."""
-
-
-class Cluster(NamedTuple):
-    """Nodes of a run, how to replace them, and how many calls each may have under way.
-
-    Workers push to `targets`: to shards that are parts of their own, or to the learner alone. `place_worker` and
-    `place_shard` take an index and an incarnation; `discard` ends a node or a call. A part that is silent for
-    `deadline_s` is late, one that has not answered yet for `start_deadline_s`. `collects_in_flight` counts
-    collects per worker, `updates_in_flight` calls of updates, `eval_tasks` the tasks of one final evaluation.
-    `abandon` ends all parts and what they write, `close` frees everything.
-    """
-
-    calls: Calls
-    incarnation: int
-    learner: Node
-    workers: list[Node]
-    targets: list[Node]
-    shards_are_parts: bool
-    place_worker: Callable[[int, int], Node]
-    place_shard: Callable[[int, int], Node]
-    discard: Callable[[Any], None]
-    deadline_s: float
-    start_deadline_s: float
-    collects_in_flight: int
-    blocks_in_flight: int
-    updates_in_flight: int
-    eval_tasks: int
-    abandon: Callable[[], None]
-    close: Callable[[], None]
-
-    @property
-    def queue_deadline_s(self) -> float:
-        """The deadline of a part that first does what it was told before, each call of it within `deadline_s`."""
-        return self.deadline_s * (1 + max(self.collects_in_flight, self.updates_in_flight))
-
-    def capacities(self, config: RunConfig) -> list[int]:
-        """Transitions that each target can hold."""
-        if not self.shards_are_parts:
-            return [config.replay_capacity]
-        return [config.replay_capacity // config.replay_shards] * config.replay_shards
-
-
-def learner_settings(config: RunConfig, shape: EnvShape) -> LearnerSettings:
-    """The learner's part of the config."""
-    return LearnerSettings(
-        observation_size=shape.observation_size,
-        num_actions=shape.num_actions,
-        hidden_sizes=config.hidden_sizes,
-        double=config.algorithm == "double_dqn",
-        batch_size=config.batch_size,
-        target_update_interval=config.target_update_interval,
-        max_gradient_norm=config.max_gradient_norm,
-        gradients=config.gradients,
-        seed=config.seed,
-        network=config.network,
-        loss=config.loss,
-        soft_target_rate=config.target_update_rate if config.target_update == "soft" else None,
-        device=config.device,
-    )
+"""How long nodes of this process may go on writing after an error; a disk that hangs must not hide that error."""
 
 
 def rollout_settings(config: RunConfig) -> RolloutSettings:
-    """The rollout workers' part of the config."""
+    """The rollout workers' settings of a run."""
     return RolloutSettings(
         env=config.env,
         num_envs=config.envs_per_worker,
@@ -95,7 +37,7 @@ def rollout_settings(config: RunConfig) -> RolloutSettings:
 
 
 def shard_settings(config: RunConfig, shape: EnvShape, incarnation: int = 0) -> list[ShardSettings]:
-    """The shards' part of the config, one a shard; a shard that replaces a lost one draws from another stream."""
+    """The settings of each shard of a run; a shard that replaces a lost one draws from another random stream."""
     entropy = (config.seed, 2, incarnation) if incarnation else (config.seed, 2)
     seeds = np.random.SeedSequence(entropy).generate_state(config.replay_shards)
     capacity = config.replay_capacity // config.replay_shards
@@ -106,39 +48,136 @@ def shard_settings(config: RunConfig, shape: EnvShape, incarnation: int = 0) -> 
     return [ShardSettings(dtype, capacity, int(seed), priorities) for seed in seeds]
 
 
-def process_cluster(config: RunConfig, incarnation: int) -> Cluster:
-    """All parts in this process, one call at a time: deterministic."""
-    calls = LocalCalls()
-    shape = env_shape(config.env)
-    shards: list[Node] = [ShardNode(settings) for settings in shard_settings(config, shape)]
-    learner = LearnerNode(learner_settings(config, shape), shards, calls)
-    targets = [learner] if config.replay_placement == "learner" else shards
+class Limits(NamedTuple):
+    """How long a component may be silent, and how many calls may be in flight.
 
-    def place_worker(worker_id: int, incarnation: int) -> Node:
-        return RolloutNode(rollout_settings(config), worker_id, incarnation, calls, targets, 0)
+    A component is late once it owes an answer for `deadline_s`, or for `start_deadline_s` if it has never answered.
+    `collects_in_flight` counts collects per rollout worker, `blocks_in_flight` the blocks of all workers that are
+    ordered and not yet stored, `updates_in_flight` calls of updates, `eval_tasks` the tasks of one final evaluation.
+    """
 
-    workers = [place_worker(worker_id, incarnation) for worker_id in range(config.workers)]
+    deadline_s: float
+    start_deadline_s: float
+    collects_in_flight: int
+    blocks_in_flight: int
+    updates_in_flight: int
+    eval_tasks: int
 
-    def abandon() -> None:
-        for node in (learner, *workers):
-            node.saved(LAST_WRITE_S)
+    @property
+    def queue_deadline_s(self) -> float:
+        """Deadline of a call that is queued behind those in flight, each of which may take `deadline_s`."""
+        return self.deadline_s * (1 + max(self.collects_in_flight, self.updates_in_flight))
 
-    return Cluster(
-        calls=calls,
-        incarnation=incarnation,
-        learner=learner,
-        workers=workers,
-        targets=targets,
-        shards_are_parts=config.replay_placement == "actors",
-        place_worker=place_worker,
-        place_shard=lambda index, incarnation: ShardNode(shard_settings(config, shape, incarnation)[index]),
-        discard=lambda node: None,
-        deadline_s=math.inf,
-        start_deadline_s=math.inf,
-        collects_in_flight=1,
-        blocks_in_flight=config.workers,
-        updates_in_flight=1,
-        eval_tasks=1,
-        abandon=abandon,
-        close=lambda: None,
-    )
+
+class Cluster(ABC):
+    """The nodes of a run, and how to place and replace them.
+
+    Args:
+      config: the run.
+      incarnation: of the learner and of the first rollout workers; shards begin with 0.
+      calls: how to call the nodes.
+      limits: see Limits.
+
+    Attributes:
+      learner, workers: their nodes.
+      shards: the nodes of the replay shards; empty if the learner embeds them.
+    """
+
+    def __init__(self, config: RunConfig, incarnation: int, calls: Calls, limits: Limits) -> None:
+        self.config = config
+        self.incarnation = incarnation
+        self.calls = calls
+        self.limits = limits
+        own_shards = config.replay_shards if config.replay_placement == "actors" else 0
+        self.shards = [self.place_shard(index, 0) for index in range(own_shards)]
+        self.learner = self.place_learner()
+        self.workers = [self.place_worker(worker_id, incarnation) for worker_id in range(config.workers)]
+
+    @property
+    def targets(self) -> Sequence[Handle[PushTarget]]:
+        """What rollout workers push to: the shards, or else the learner alone."""
+        return self.shards or [self.learner]
+
+    @property
+    def capacities(self) -> list[int]:
+        """Transitions that each target can hold."""
+        return [self.config.replay_capacity // len(self.targets)] * len(self.targets)
+
+    @abstractmethod
+    def place_learner(self) -> Handle[LearnerNode]:
+        """Makes the learner, which samples from the present `shards`."""
+
+    @abstractmethod
+    def place_worker(self, worker_id: int, incarnation: int) -> Handle[RolloutNode]:
+        """Makes a rollout worker, which pushes to the present `targets`."""
+
+    @abstractmethod
+    def place_shard(self, index: int, incarnation: int) -> Handle[ShardNode]:
+        """Makes an empty shard."""
+
+    @abstractmethod
+    def discard(self, node: Handle[Any]) -> None:
+        """Ends a node."""
+
+    @abstractmethod
+    def cancel(self, ref: Ref[Any]) -> None:
+        """Ends a call that nobody waits for any more."""
+
+    @abstractmethod
+    def abandon(self) -> None:
+        """Ends all nodes and what they write."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Frees everything."""
+
+
+class ProcessCluster(Cluster):
+    """All nodes in this process, one call at a time: deterministic.
+
+    Args:
+      config: the run.
+      incarnation: see Cluster.
+      calls: how the nodes call each other, LocalCalls by default.
+    """
+
+    def __init__(self, config: RunConfig, incarnation: int, calls: Calls | None = None) -> None:
+        self._shape = env_shape(config.env)
+        limits = Limits(
+            deadline_s=math.inf,
+            start_deadline_s=math.inf,
+            collects_in_flight=1,
+            blocks_in_flight=config.workers,
+            updates_in_flight=1,
+            eval_tasks=1,
+        )
+        super().__init__(config, incarnation, calls or LocalCalls(), limits)
+
+    def place_learner(self) -> Handle[LearnerNode]:
+        """Makes the learner, with shards of its own if there are no others."""
+        shards = self.shards or [self.place_shard(index, 0) for index in range(self.config.replay_shards)]
+        return local_handle(LearnerNode(self.config, self._shape, shards, self.calls))
+
+    def place_worker(self, worker_id: int, incarnation: int) -> Handle[RolloutNode]:
+        """Makes a rollout worker whose pushes are stored when `collect` returns."""
+        settings = rollout_settings(self.config)
+        return local_handle(RolloutNode(settings, worker_id, incarnation, self.calls, self.targets, 0))
+
+    def place_shard(self, index: int, incarnation: int) -> Handle[ShardNode]:
+        """Makes an empty shard."""
+        return local_handle(ShardNode(shard_settings(self.config, self._shape, incarnation)[index]))
+
+    def discard(self, node: Handle[Any]) -> None:
+        """Does nothing: whoever holds no handle of it frees it."""
+
+    def cancel(self, ref: Ref[Any]) -> None:
+        """Does nothing: the call has ended."""
+
+    def abandon(self) -> None:
+        """Waits until no node writes any more."""
+        nodes: list[Handle[Checkpointable]] = [self.learner, *self.workers]
+        for node in nodes:
+            LocalCalls().start(node, Checkpointable.saved, LAST_WRITE_S)
+
+    def close(self) -> None:
+        """Does nothing."""

@@ -1,4 +1,4 @@
-"""How far a run is: the driver's counters, accounts and sums, as state that a checkpoint holds."""
+"""How far a run has come: the driver's counters, accounts and sums, which a checkpoint holds."""
 
 from __future__ import annotations
 
@@ -14,12 +14,15 @@ from learner.update.learner_node import UpdateReport
 
 
 class Progress:
-    """What the driver of a run counts.
+    """Everything that the driver of a run counts.
 
     Args:
       config: the run.
       pacer: its pacing.
       ledger: its accounts.
+
+    Attributes:
+      env_steps, updates: so far.
     """
 
     def __init__(self, config: RunConfig, pacer: Pacer, ledger: Ledger) -> None:
@@ -35,26 +38,26 @@ class Progress:
         }
         self._due = dict(self._every)
 
-    def take_block(self, report: BlockReport) -> None:
+    def record_block(self, report: BlockReport) -> None:
         """Counts a block that a rollout worker reports."""
-        self.pacer.inserted(self.ledger.take(report))
-        self.meters.take_block(report)
+        self.pacer.record_insert(self.ledger.record_block(report))
+        self.meters.record_block(report)
         self.env_steps += report.header.env_steps
 
-    def take_updates(self, report: UpdateReport, updates: int) -> None:
+    def record_updates(self, report: UpdateReport) -> None:
         """Counts a call of updates."""
-        self.meters.take_updates(report, updates)
+        self.meters.record_updates(report, report.version - self.updates)
         self.updates = report.version
 
-    def is_due(self, what: str) -> bool:
-        """Whether `env_steps` has passed the next multiple of what `what` is done every; moves on to the one after."""
-        if self.env_steps < self._due[what]:
+    def take_due(self, event: str) -> bool:
+        """True once per interval of `event` ("log", "eval" or "checkpoint"); advances its deadline."""
+        if self.env_steps < self._due[event]:
             return False
-        self._due[what] = (self.env_steps // self._every[what] + 1) * self._every[what]
+        self._due[event] = (self.env_steps // self._every[event] + 1) * self._every[event]
         return True
 
     def row(self) -> dict[str, float]:
-        """The metrics of training since the last row, and the accounts."""
+        """The training metrics since the last row, and the accounts."""
         row = self.meters.row(self.ledger.replay_size, self.pacer.ratio()) | self.ledger.row()
         pacing = self.pacer.state
         counts = {
@@ -66,7 +69,7 @@ class Progress:
         return row | {f"{ACCOUNT}{name}": float(count) for name, count in counts.items()}
 
     def get_state(self) -> dict[str, Any]:
-        """All of it, for JSON; nothing that happens later changes it."""
+        """A copy of all of it, for JSON."""
         return {
             "env_steps": self.env_steps,
             "updates": self.updates,
@@ -77,9 +80,9 @@ class Progress:
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Takes up what `get_state` gave."""
+        """Restores what `get_state` returned."""
         self.env_steps, self.updates = state["env_steps"], state["updates"]
         self.pacer.state = PacingState(**state["pacing"])
         self.meters.set_state(state["meters"])
         self.ledger.set_state(state["ledger"])
-        self._due = {what: int(state["due"][what]) for what in self._due}
+        self._due = {event: int(state["due"][event]) for event in self._due}

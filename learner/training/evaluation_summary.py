@@ -1,4 +1,4 @@
-"""Summary of ended episodes: rates, means and their confidence intervals, as metrics."""
+"""Summary of finished episodes: rates and means with confidence intervals, and their metrics."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sim_core.outcomes import ENDED, Outcome
 
 
 class Evaluation(NamedTuple):
-    """Summary of evaluated episodes; `rates` is empty where the environment names no outcomes."""
+    """Summary of evaluated episodes; `rates` is empty if the environment reports no outcomes."""
 
     episodes: int
     rates: dict[Outcome, Estimate]
@@ -20,7 +20,7 @@ class Evaluation(NamedTuple):
 
 
 def summarise(stats: EpisodeStats) -> Evaluation:
-    """Summary of one entry per episode.
+    """Summarises statistics with one entry per episode.
 
     Raises:
       ValueError: there are no episodes.
@@ -36,17 +36,17 @@ def summarise(stats: EpisodeStats) -> Evaluation:
 
 
 def score(evaluation: Evaluation) -> float:
-    """What policies of one setup are compared by: the success rate or, without outcomes, the mean return."""
+    """The score by which policies of one setup are compared: success rate or, without outcomes, mean return."""
     return evaluation.rates.get(Outcome.GOAL, evaluation.episode_return).value
 
 
 def outcome_label(outcome: Outcome) -> str:
-    """Metric name of an outcome's rate."""
+    """Metric name of the rate of an outcome."""
     return "success_rate" if outcome is Outcome.GOAL else f"{outcome.name.lower()}_rate"
 
 
 def as_metrics(evaluation: Evaluation) -> dict[str, float]:
-    """Flat metrics of an evaluation: every rate or, without outcomes, the return with its interval."""
+    """Flat metrics: mean return and length, and each rate or, without outcomes, the return with its interval."""
     metrics = {"return": evaluation.episode_return.value, "episode_length": evaluation.episode_length.value}
     estimates = {outcome_label(kind): estimate for kind, estimate in evaluation.rates.items()}
     if not estimates:

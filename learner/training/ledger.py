@@ -1,7 +1,7 @@
-"""The run's accounts: every transition that was made is stored or dropped for a reason.
+"""The run's accounts: every transition that was produced is stored, or dropped for a reason.
 
-What was made comes from the rollout workers' own counts, what was stored from the shards' replies, what was
-dropped from reports; so the two sides can only be equal if no hop loses or doubles anything.
+Produced transitions are counted by the rollout workers, stored ones by the shards' replies, dropped ones by the reports
+of blocks. The three sources are independent, so produced = stored + dropped holds only if no hop loses or doubles one.
 """
 
 from __future__ import annotations
@@ -17,11 +17,16 @@ ROWS, ENV_STEPS, EPISODES = range(3)
 
 
 class Ledger:
-    """Counts transitions from their making to their storage.
+    """Counts transitions from their production to their storage.
 
     Args:
       workers: number of rollout workers.
       capacities: transitions that each target of their pushes can hold.
+
+    Attributes:
+      produced, stored: transitions so far.
+      dropped: transitions so far, by the reason (see `Dropped`).
+      episodes: ended episodes so far.
     """
 
     def __init__(self, workers: int, capacities: list[int]) -> None:
@@ -33,12 +38,7 @@ class Ledger:
         self._held = [0] * len(capacities)  # stored by the target's present incarnation, overwritten ones included
         self._shard_incarnations = [0] * len(capacities)
         self._made = [0] * workers  # by the worker's present incarnation, as far as is known
-        self._reported = np.zeros((workers, len(capacities), 3), np.int64)
-
-    @property
-    def balances(self) -> bool:
-        """Whether transitions made = stored + dropped."""
-        return self.produced == self.stored + sum(self.dropped.values())
+        self._reported = np.zeros((workers, len(capacities), 3), np.int64)  # ROWS, ENV_STEPS, EPISODES by present ones
 
     @property
     def replay_size(self) -> int:
@@ -48,10 +48,10 @@ class Ledger:
     def _sizes(self) -> list[int]:
         return [min(held, capacity) for held, capacity in zip(self._held, self._capacities, strict=True)]
 
-    def take(self, report: BlockReport) -> int:
-        """Books a block; returns its transitions that count as stored: none if their shard is gone already."""
+    def record_block(self, report: BlockReport) -> int:
+        """Books a block; returns how many of its transitions count as stored: none if their shard has been replaced."""
         worker_id = report.header.worker_id
-        self._announce(worker_id, report.header.made)
+        self._record_made(worker_id, report.header.made)
         self.episodes += len(report.episodes.outcome)
         if report.dropped is not None:
             self.dropped[report.dropped] += report.rows
@@ -65,22 +65,26 @@ class Ledger:
         self._reported[worker_id, report.shard] += booked
         return report.stored
 
-    def _announce(self, worker_id: int, made: int) -> int:
-        """Books what a worker has made in all; returns what is new of it."""
+    def _record_made(self, worker_id: int, made: int) -> int:
+        """Books that a worker's present incarnation has made `made` transitions in all; returns how many are new."""
         new = max(0, made - self._made[worker_id])
         self._made[worker_id] += new
         self.produced += new
         return new
 
-    def worker_lost(self, worker_id: int, delivered: list[Delivered]) -> Delivered:
-        """Closes a worker's books with what the shards, one entry each, say that it delivered.
+    def write_off_worker(self, worker_id: int, delivered: list[Delivered]) -> Delivered:
+        """Closes the books of a lost worker.
+
+        Args:
+          worker_id: which.
+          delivered: what each target has stored of it.
 
         Returns:
           What it had delivered without a report.
         """
-        unreported = np.array([part[:3] for part in delivered]) - self._reported[worker_id]
+        unreported = np.array([each[:3] for each in delivered]) - self._reported[worker_id]
         rows, env_steps, episodes = (int(total) for total in unreported.sum(axis=0))
-        new = self._announce(worker_id, max(part.made for part in delivered))
+        new = self._record_made(worker_id, max(each.made for each in delivered))
         self.stored += rows
         self.episodes += episodes
         self.dropped[Dropped.WORKER_LOST] += new - rows
@@ -90,8 +94,8 @@ class Ledger:
         self._made[worker_id] = 0
         return Delivered(rows, env_steps, episodes, 0)
 
-    def shard_lost(self, shard: int, incarnation: int) -> float:
-        """Books that a shard is empty and under its new incarnation; returns the share of the replay that is gone."""
+    def write_off_shard(self, shard: int, incarnation: int) -> float:
+        """Books that a shard is empty, under its new incarnation; returns the share of the replay that is lost."""
         sizes = self._sizes()
         self._held[shard] = 0
         self._shard_incarnations[shard] = incarnation
@@ -108,7 +112,7 @@ class Ledger:
         }
 
     def get_state(self) -> dict[str, Any]:
-        """The sums, for JSON; workers and shards count anew on resume."""
+        """The sums, for JSON; the counts by incarnation start anew on resume."""
         return {
             "produced": self.produced,
             "stored": self.stored,
@@ -118,7 +122,7 @@ class Ledger:
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Takes up what `get_state` gave."""
+        """Restores what `get_state` returned."""
         self.produced, self.stored, self.episodes = state["produced"], state["stored"], state["episodes"]
         self.dropped |= state["dropped"]
         self._held = list(state["held"])

@@ -1,4 +1,4 @@
-"""How much memory a run needs, roughly: enough to refuse at the start what no machine could hold."""
+"""A rough estimate of the memory that a run needs, which refuses at the start what this machine cannot hold."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from learner.config import RunConfig
 from sim_core.checks import require
 
 ROBOT_BYTES = 200
-"""Of one robot in one world: its state, neighbours and velocities."""
+"""Bytes of one robot in one world: its state, neighbours and velocities."""
 PROCESS_BYTES = 150_000_000
-"""Of one Ray actor before it holds anything: Python, PyTorch and the simulator's kernels."""
+"""Bytes of an empty Ray actor: Python, PyTorch and the simulator's kernels."""
 EPISODE_BYTES = 100
-"""Of one evaluated episode: its seed and its result."""
+"""Bytes of one evaluated episode: its seed and its result."""
 PRIORITY_BYTES = 32
-"""Of one transition's priority: the sum tree has twice as many float64, of which half may lie idle."""
+"""Bytes of one transition's priority: two float64 per leaf of the sum tree, whose leaves are a power of 2."""
 FRAME_PLACES = 2
-"""Of one frame of the replay: their number is a power of 2, of which half may be empty."""
+"""Places per frame of the replay: their number is rounded up to a power of 2, so up to half are empty."""
 NETWORK_COPIES = 5
-"""Online and target network, gradients, and Adam's two moments."""
+"""Arrays of the size of the network: online and target network, gradients, and Adam's two moments."""
 
 
-def parts_bytes(config: RunConfig, shape: EnvShape) -> dict[str, int]:
-    """Bytes of each part, by the settings that decide its size."""
+def bytes_by_setting(config: RunConfig, shape: EnvShape) -> dict[str, int]:
+    """Bytes that a run needs, by the settings that decide them."""
     transition = transition_dtype(shape.observation_space)
     row, packed = transition.itemsize, packed_dtype(transition).itemsize
     frames = estimate_frames(config.replay_capacity, config.steps_per_block, config.n_step)
@@ -52,18 +52,18 @@ def parts_bytes(config: RunConfig, shape: EnvShape) -> dict[str, int]:
 
 
 def check_fits(config: RunConfig) -> EnvShape:
-    """The spaces of a run's environment, which this machine has the memory for.
+    """Checks that this machine has the memory for a run; returns the spaces of its environment.
 
     Raises:
-      ConfigError: it has not; or the environment cannot be made.
+      ConfigError: it has not, or the environment cannot be made.
     """
     shape = env_shape(config.env)
-    parts, total = parts_bytes(config, shape), psutil.virtual_memory().total
-    largest = max(parts, key=lambda name: parts[name])
-    need = sum(parts.values())
+    needs, total = bytes_by_setting(config, shape), psutil.virtual_memory().total
+    largest = max(needs, key=lambda settings: needs[settings])
+    need = sum(needs.values())
     require(
         need <= total,
-        f"{config.name} needs about {_gigabytes(need)} of memory, {_gigabytes(parts[largest])} of it by {largest}, "
+        f"{config.name} needs about {_gigabytes(need)} of memory, {_gigabytes(needs[largest])} of it by {largest}, "
         f"and this machine has {_gigabytes(total)}: lower them, or train on a cluster (--address)",
     )
     return shape

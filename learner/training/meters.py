@@ -12,11 +12,11 @@ from learner.update.learner_node import PUBLISHES, SAMPLES, UPDATES, UpdateRepor
 from sim_core.outcomes import Outcome
 
 HOPS = {"worker": (ACTS, STORES, WAITS), "learner": (UPDATES, SAMPLES, PUBLISHES, STORES, WAITS)}
-"""What a part's time goes to; the shares of all rollout workers together, and of the learner, sum to 1."""
+"""How a component's time is split; the shares sum to 1, for all rollout workers together and for the learner."""
 
 
 class Meters:
-    """Collects what happened since the last row."""
+    """Sums up what has happened since the last row."""
 
     def __init__(self) -> None:
         self._sums: dict[str, float] = {}
@@ -25,14 +25,14 @@ class Meters:
         self._measured = {"env_steps": 0.0, "updates": 0.0}
 
     def start_clock(self) -> None:
-        """Speeds of the next row count from now."""
+        """Starts the interval over which the next row's speeds are measured."""
         self._start_s = time.perf_counter()
 
     def _add(self, **values: float) -> None:
         for name, value in values.items():
             self._sums[name] = self._sums.get(name, 0.0) + value
 
-    def take_block(self, report: BlockReport) -> None:
+    def record_block(self, report: BlockReport) -> None:
         """Counts a stored block."""
         self._epsilon = report.header.epsilon
         episodes = report.episodes
@@ -45,20 +45,20 @@ class Meters:
             successes=float((episodes.outcome == Outcome.GOAL).sum()),
         )
         self._measured["env_steps"] += report.header.env_steps
-        self._take_seconds("worker", report.seconds)
+        self._add_seconds("worker", report.seconds)
 
-    def take_updates(self, report: UpdateReport, updates: int) -> None:
-        """Counts a call of updates."""
+    def record_updates(self, report: UpdateReport, updates: int) -> None:
+        """Counts a call of `updates` updates."""
         stats = report.stats
         self._add(calls=1, loss=stats.loss, q_mean=stats.q_mean, td_error=stats.td_error)
         self._measured["updates"] += updates
-        self._take_seconds("learner", report.seconds)
+        self._add_seconds("learner", report.seconds)
 
-    def _take_seconds(self, part: str, seconds: dict[str, float]) -> None:
-        self._add(**{f"{part}_{what}": value for what, value in seconds.items()})
+    def _add_seconds(self, component: str, seconds: dict[str, float]) -> None:
+        self._add(**{f"{component}_{hop}": value for hop, value in seconds.items()})
 
     def row(self, replay_size: int, samples_per_insert: float) -> dict[str, float]:
-        """The metrics since the last row; starts the next."""
+        """The metrics since the last row; resets the sums."""
         metrics = {"train/epsilon": self._epsilon, "replay/size": float(replay_size)}
         metrics["replay/samples_per_insert"] = samples_per_insert
         metrics |= self._means("train/", "episodes", {"return": "episode_return", "episode_length": "episode_length"})
@@ -76,8 +76,8 @@ class Meters:
 
     def _shares(self) -> dict[str, float]:
         shares: dict[str, float] = {}
-        for part, hops in HOPS.items():
-            seconds = {f"time/{part}_{hop}": self._sums.get(f"{part}_{hop}", 0.0) for hop in hops}
+        for component, hops in HOPS.items():
+            seconds = {f"time/{component}_{hop}": self._sums.get(f"{component}_{hop}", 0.0) for hop in hops}
             total = sum(seconds.values())
             shares |= {name: value / total for name, value in seconds.items()} if total else {}
         return shares
@@ -93,9 +93,9 @@ class Meters:
         }
 
     def get_state(self) -> dict[str, Any]:
-        """The sums, for JSON; clocks start anew on resume."""
+        """The sums, for JSON; the clock starts anew on resume."""
         return {"sums": dict(self._sums), "epsilon": self._epsilon}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Takes up what `get_state` gave."""
+        """Restores what `get_state` returned."""
         self._sums, self._epsilon = dict(state["sums"]), state["epsilon"]

@@ -1,10 +1,19 @@
-"""Carries out what the decision table says about a failed part: retry, restart, rebuild or stop."""
+"""Recovery of failed components: carries out what the decision table says, which is retry, restart, rebuild or stop.
+
+A dead replay shard, step by step: the learner's call or a worker's push fails (`ComponentFailed`);
+`actors.service.fault_policy.decide` answers RESTART; `Supervisor.recover` places an empty shard under a new
+incarnation, writes the lost transitions off, and announces the shard to the learner and to all rollout workers.
+"""
 
 from __future__ import annotations
 
 import time
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from typing import Protocol, TypeVar, TypeVarTuple
 
+from actors.policy.network import WeightsSnapshot
+from actors.replay.node import ShardNode
+from actors.rollout.node import PushTarget, RolloutNode
 from actors.service.fault_policy import (
     Action,
     CallFailed,
@@ -18,18 +27,24 @@ from actors.service.fault_policy import (
     RunFailed,
 )
 from actors.service.messages import BlockReport, Delivered
-from actors.service.rpc import Node, Ref
+from actors.service.rpc import Placed, Ref, by_reference
 from learner.training.cluster import Cluster
-from learner.training.in_flight import UnderWay
+from learner.training.in_flight import InFlight
 from learner.training.ledger import Ledger
 from learner.training.pacing import Pacer
+from learner.update.learner_node import LearnerNode
+
+A = TypeVar("A")
+N = TypeVar("N")
+T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
 
 SLOW = ("load",)
-"""Calls that read the whole of a part."""
+"""Methods that read a component's whole state; they may take as long as a start."""
 
 
 class RunLost(Exception):
-    """A part is gone that only a checkpoint can bring back.
+    """A component is gone that only a checkpoint can bring back.
 
     Args:
       failure: which and how.
@@ -42,131 +57,138 @@ class RunLost(Exception):
 
 
 class FaultObserver(Protocol):
-    """What is told of failures."""
+    """Hears of failures."""
 
     def failed(self, failure: ComponentFailed, decision: Decision) -> None:
-        """A part failed, and this will be done about it."""
+        """A component failed; `decision` says what is done about it."""
         ...
 
-    def mended(self, mended: Recovered) -> None:
-        """A part that had failed works again."""
+    def recovered(self, recovered: Recovered) -> None:
+        """A component that had failed works again."""
         ...
 
 
-class Mender:
-    """Knows every part's incarnation, and replaces parts in a running cluster.
+class Supervisor:
+    """Calls the components of a run, knows their incarnations, and replaces those that fail.
 
     Args:
-      cluster: the run's parts; its lists of nodes are kept up to date.
-      recovery: decides.
-      under_way: the loop's calls.
-      pacer: its counters are reconciled with what was lost.
-      ledger: its accounts are as well.
-      observer: is told.
+      cluster: the run's nodes; its lists are kept up to date.
+      faults: decides.
+      in_flight: the loop's calls; those of a failed component are forgotten.
+      pacer, ledger: are told of what was lost.
+      observer: hears of failures.
     """
 
     def __init__(
         self,
         cluster: Cluster,
-        recovery: FaultTracker,
-        under_way: UnderWay,
+        faults: FaultTracker,
+        in_flight: InFlight,
         pacer: Pacer,
         ledger: Ledger,
         observer: FaultObserver,
     ) -> None:
         self._cluster = cluster
-        self._recovery = recovery
-        self._under_way = under_way
+        self._calls = cluster.calls
+        self._faults = faults
+        self._in_flight = in_flight
         self._pacer = pacer
         self._ledger = ledger
         self._observer = observer
         self._incarnations: dict[Component, int] = {}
         self.highest = cluster.incarnation
-        """The highest incarnation so far; the next restart, of whichever part, gets the one after."""
+        """The highest incarnation so far; whichever component is restarted next gets the one after it."""
 
-    def incarnation(self, part: Component) -> int:
-        """The part's present incarnation: of a shard, 0 for its first in this sitting."""
-        return self._incarnations.get(part, 0 if part.kind is ComponentKind.SHARD else self._cluster.incarnation)
-
-    def node(self, part: Component) -> Node:
-        """Where the part is."""
-        if part.kind is ComponentKind.LEARNER:
-            return self._cluster.learner
-        return (self._cluster.workers if part.kind is ComponentKind.WORKER else self._cluster.targets)[part.number]
+    def incarnation(self, component: Component) -> int:
+        """The component's present incarnation; the first shards of a session have 0."""
+        first = 0 if component.kind is ComponentKind.SHARD else self._cluster.incarnation
+        return self._incarnations.get(component, first)
 
     @property
-    def workers(self) -> list[Component]:
-        """The rollout workers."""
-        return [Component(ComponentKind.WORKER, worker_id) for worker_id in range(len(self._cluster.workers))]
+    def learner(self) -> Placed[LearnerNode]:
+        """The learner."""
+        return Placed(Component(ComponentKind.LEARNER), self._cluster.incarnation, self._cluster.learner)
 
-    def ask(self, part: Component, method: str, *args: Any) -> Any:
-        """Calls a part and waits for the answer.
+    @property
+    def workers(self) -> list[Placed[RolloutNode]]:
+        """The rollout workers."""
+        return [self._worker(worker_id) for worker_id in range(len(self._cluster.workers))]
+
+    def _worker(self, worker_id: int) -> Placed[RolloutNode]:
+        component = Component(ComponentKind.WORKER, worker_id)
+        return Placed(component, self.incarnation(component), self._cluster.workers[worker_id])
+
+    def _shard(self, index: int) -> Placed[ShardNode]:
+        component = Component(ComponentKind.SHARD, index)
+        return Placed(component, self.incarnation(component), self._cluster.shards[index])
+
+    def _target(self, index: int) -> Placed[PushTarget]:
+        """What rollout workers push to under this index."""
+        return self._shard(index) if self._cluster.shards else self.learner
+
+    def ask(self, placed: Placed[N], method: Callable[[N, *Ts], T], *args: *Ts) -> T:
+        """Calls a component and waits for the answer.
 
         Raises:
           ComponentFailed: there is none.
         """
-        return self.ask_all(method, {part: args})[0]
+        return self._answer(placed, method.__name__, self._calls.start(placed.node, method, *args))
 
-    def ask_all(self, method: str, args: dict[Component, tuple[Any, ...]]) -> list[Any]:
-        """Calls several parts at once, each with its own arguments, and waits for their answers, in order.
+    def ask_all(self, method: Callable[[N, A], T], arguments: Sequence[tuple[Placed[N], A]]) -> list[T]:
+        """Calls several components at once, each with its own argument, and waits for their answers, in order.
 
         Raises:
           ComponentFailed: one is missing.
         """
-        refs = {part: self._cluster.calls.start(self.node(part), method, *given) for part, given in args.items()}
-        return [self._answer(part, method, ref) for part, ref in refs.items()]
+        started = [(placed, self._calls.start(placed.node, method, argument)) for placed, argument in arguments]
+        return [self._answer(placed, method.__name__, ref) for placed, ref in started]
 
-    def _answer(self, part: Component, method: str, ref: Ref) -> Any:
-        calls = self._cluster.calls
-        patience_s = self._cluster.start_deadline_s if method in SLOW else self._under_way.patience_with(part)
+    def _answer(self, placed: Placed[N], method: str, ref: Ref[T]) -> T:
+        component, incarnation, _ = placed
+        limits = self._cluster.limits
+        deadline_s = limits.start_deadline_s if method in SLOW else self._in_flight.deadline_of(component)
         try:
-            if not calls.wait([ref], patience_s):
-                raise CallFailed(Fault.LATE, f"silent for {patience_s:.0f} s")
-            answer = calls.get(ref)
+            if not self._calls.wait([ref], deadline_s):
+                raise CallFailed(Fault.LATE, f"silent for {deadline_s:.0f} s")
+            answer = self._calls.get(ref)
         except CallFailed as failure:
-            reason = f"{method}: {failure.reason}"
-            raise ComponentFailed(part, self.incarnation(part), failure.fault, reason) from failure
-        self._under_way.heard(part)
+            raise failure.of(component, incarnation, method) from failure
+        self._in_flight.record_answer(component)
         return answer
 
-    def weights_ref(self) -> Ref:
+    def weights_ref(self) -> Ref[WeightsSnapshot]:
         """A reference to the learner's weights, which may not be there yet."""
-        return self._cluster.calls.start(self._cluster.learner, "weights")
-
-    def target(self, index: int) -> Component:
-        """What workers push to under this index."""
-        return (
-            Component(ComponentKind.SHARD, index)
-            if self._cluster.shards_are_parts
-            else Component(ComponentKind.LEARNER)
-        )
+        return self._calls.start(self._cluster.learner, LearnerNode.weights)
 
     def check_push(self, report: BlockReport) -> ComponentFailed | None:
-        """What a worker's push says of where it went; one that went to a replaced shard is told of the new one."""
-        target, pushed_to = self.target(report.shard), report.shard_incarnation
-        if target.kind is ComponentKind.LEARNER:
-            pushed_to = self._cluster.incarnation
-        elif pushed_to < self.incarnation(target):
-            self._tell(report.header.worker_id, target)
+        """The failure of the target that a block was pushed to, or None.
+
+        A worker that pushed to a shard that has been replaced is told of the new one.
+        """
+        target, pushed_to = self._target(report.shard), report.shard_incarnation
+        if target.component.kind is ComponentKind.LEARNER:
+            pushed_to = target.incarnation
+        elif pushed_to < target.incarnation:
+            self._announce_shard(self._worker(report.header.worker_id), target)
             return None
         if report.fault is None:
-            self.worked(target)
+            self.record_success(target.component)
             return None
-        return ComponentFailed(target, pushed_to, report.fault, "a push to it failed")
+        return ComponentFailed(target.component, pushed_to, report.fault, "a push to it failed")
 
-    def _tell(self, worker_id: int, shard: Component) -> None:
-        """Names a worker the present incarnation of a shard."""
-        node, incarnation = self.node(shard), self.incarnation(shard)
-        self._cluster.calls.start(self._cluster.workers[worker_id], "replace_shard", shard.number, node, incarnation)
+    def _announce_shard(self, worker: Placed[RolloutNode], shard: Placed[PushTarget]) -> None:
+        """Gives a worker the present incarnation of a shard."""
+        index = shard.component.number
+        self._calls.start(worker.node, RolloutNode.replace_shard, index, shard.node, shard.incarnation)
 
-    def worked(self, part: Component) -> None:
-        """Notes that a part has done a call."""
-        mended = self._recovery.record_success(part, time.monotonic())
-        if mended is not None:
-            self._observer.mended(mended)
+    def record_success(self, component: Component) -> None:
+        """Records that a component has done a call."""
+        recovered = self._faults.record_success(component, time.monotonic())
+        if recovered is not None:
+            self._observer.recovered(recovered)
 
     def decide(self, failure: ComponentFailed) -> Action:
-        """Asks the decision table, and tells the observer.
+        """Asks the decision table what to do about a failure, and tells the observer.
 
         Returns:
           RETRY or RESTART.
@@ -175,19 +197,16 @@ class Mender:
           RunLost: the run must go on from its last checkpoint.
           RunFailed: it cannot go on.
         """
-        decision = self._recovery.record_failure(failure, time.monotonic())
+        decision = self._faults.record_failure(failure, time.monotonic())
         self._observer.failed(failure, decision)
         if decision.action is Action.STOP:
-            raise RunFailed(f"{failure}, {decision.attempts} times in a row; mend the cause, then go on with resume")
+            raise RunFailed(f"{failure}, {decision.attempts} times in a row; fix the cause, then go on with resume")
         if decision.action is Action.REBUILD:
             raise RunLost(failure, self.highest)
         return decision.action
 
-    def mend(self, failure: ComponentFailed) -> Delivered:
-        """Does what there is to do about a failure; nothing if the part has been replaced since.
-
-        Args:
-          failure: which part, and how.
+    def recover(self, failure: ComponentFailed) -> Delivered:
+        """Retries or restarts the failed component; does nothing if it has been replaced since.
 
         Returns:
           What a lost worker had stored without a report.
@@ -196,52 +215,56 @@ class Mender:
           RunLost: see `decide`.
           RunFailed: see `decide`.
         """
-        if failure.incarnation < self.incarnation(failure.component):
+        component = failure.component
+        if failure.incarnation < self.incarnation(component):
             return Delivered()
         if self.decide(failure) is Action.RETRY:
-            for ref in self._under_way.forget(failure.component):
-                self._cluster.discard(ref)  # it may only be late
+            for ref in self._in_flight.forget(component):
+                self._cluster.cancel(ref)  # it may only be late
             return Delivered()
         while True:
             try:
-                if failure.component.kind is ComponentKind.WORKER:
-                    return self._restart_worker(failure.component)
-                return self._restart_shard(failure.component)
+                if component.kind is ComponentKind.WORKER:
+                    return self._restart_worker(component.number)
+                return self._restart_shard(component.number)
             except ComponentFailed as another:
-                if another.component == failure.component:
-                    return self.mend(another)
-                self.mend(another)
+                if another.component == component:
+                    return self.recover(another)
+                self.recover(another)
 
     def _next_incarnation(self) -> int:
         self.highest += 1
         return self.highest
 
-    def _restart_worker(self, part: Component) -> Delivered:
-        cluster, index = self._cluster, part.number
-        cluster.discard(cluster.workers[index])
-        closed, incarnation = self.incarnation(part), self._next_incarnation()
-        targets = [self.target(i) for i in range(len(cluster.targets))]
-        delivered = [self.ask(target, "fence", index, closed, incarnation) for target in targets]
-        self._incarnations[part] = incarnation
-        unreported = self._ledger.worker_lost(index, delivered)
-        self._pacer.inserted(unreported.rows)
-        self._under_way.forget(part)
-        worker = cluster.workers[index] = cluster.place_worker(index, incarnation)
+    def _restart_worker(self, worker_id: int) -> Delivered:
+        """Fences the lost worker off, and starts a new one with the current weights."""
+        cluster, lost, incarnation = self._cluster, self._worker(worker_id), self._next_incarnation()
+        cluster.discard(lost.node)
+        targets = [self._target(index) for index in range(len(cluster.targets))]
+        delivered = [self.ask(target, PushTarget.fence, worker_id, lost.incarnation, incarnation) for target in targets]
+        self._incarnations[lost.component] = incarnation
+        unreported = self._ledger.write_off_worker(worker_id, delivered)
+        self._pacer.record_insert(unreported.rows)
+        self._in_flight.forget(lost.component)
+        cluster.workers[worker_id] = cluster.place_worker(worker_id, incarnation)
+        worker = self._worker(worker_id)
         for target in targets:
-            if target in self._incarnations:
-                self._tell(index, target)
-        cluster.calls.start(worker, "set_weights", self.weights_ref())
+            if target.component in self._incarnations:
+                self._announce_shard(worker, target)
+        self._calls.start(worker.node, RolloutNode.set_weights, by_reference(self.weights_ref()))
         return unreported
 
-    def _restart_shard(self, part: Component) -> Delivered:
-        cluster, index = self._cluster, part.number
-        cluster.discard(cluster.targets[index])
-        self._under_way.forget(part)
-        incarnation = self._incarnations[part] = self._next_incarnation()
-        shard = cluster.targets[index] = cluster.place_shard(index, incarnation)
-        self.ask(part, "size")  # others must not wait for it while it starts
-        self._pacer.lost(self._ledger.shard_lost(index, incarnation))
-        self.ask(Component(ComponentKind.LEARNER), "replace_shard", index, shard, incarnation)
-        for worker_id in range(len(cluster.workers)):
-            self._tell(worker_id, part)
+    def _restart_shard(self, index: int) -> Delivered:
+        """Starts an empty shard, writes the lost transitions off, and announces the shard to learner and workers."""
+        cluster, lost = self._cluster, self._shard(index)
+        cluster.discard(lost.node)
+        self._in_flight.forget(lost.component)
+        incarnation = self._incarnations[lost.component] = self._next_incarnation()
+        cluster.shards[index] = cluster.place_shard(index, incarnation)
+        shard = self._shard(index)
+        self.ask(shard, ShardNode.size)  # waits for its start, so that nobody else has to
+        self._pacer.write_off(self._ledger.write_off_shard(index, incarnation))
+        self.ask(self.learner, LearnerNode.replace_shard, index, shard.node, incarnation)
+        for worker in self.workers:
+            self._announce_shard(worker, shard)
         return Delivered()

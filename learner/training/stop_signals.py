@@ -1,4 +1,4 @@
-"""Ending a run early on Ctrl-C or SIGTERM, with time to save."""
+"""Graceful stop: Ctrl-C or SIGTERM ends a run early, with time to write a checkpoint."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from types import FrameType
 
 
 class StopRequest:
-    """Remembers the first signal; a second Ctrl-C interrupts at once."""
+    """Remembers the first signal; a second signal that is Ctrl-C interrupts at once."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
 
     def __call__(self) -> bool:
-        """Whether a signal came."""
+        """Whether a signal has arrived."""
         return self.signal is not None
 
     def handle(self, number: int, frame: FrameType | None) -> None:
@@ -28,9 +28,9 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Turns SIGINT and SIGTERM into a StopRequest; enter after Ray has started, which sets its own handlers.
+    """Turns SIGINT and SIGTERM into a StopRequest; enter it after Ray has started, since Ray sets handlers of its own.
 
-    Only a process's main thread can be asked so; in another one, such as a cell of a sweep, the request never comes.
+    Python delivers signals to the main thread only. In another thread, such as a cell of a sweep, no request arrives.
     """
     request = StopRequest()
     is_main = threading.current_thread() is threading.main_thread()

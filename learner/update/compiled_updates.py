@@ -1,14 +1,16 @@
-"""Updates that are compiled whole: minibatch after minibatch, with neither Python nor PyTorch in between.
+"""Compiled updates: a kernel makes all updates of a call, without Python or PyTorch between two minibatches.
 
-For a plain network on the CPU. Small networks are bound by what surrounds their arithmetic; here that is a few loops
-which go over memory once, and matrix products by the BLAS that SciPy brings. It is the arithmetic of
-`learner.update.gradients` and PyTorch's Adam on the same memory, with the same result to rounding, and one more
-shortcut: only the taken action's value has a slope, so that the last layer needs no matrix product on the way back.
+For plain networks on the CPU. Small networks are bound by overhead; here the overhead is a few loops over contiguous
+memory, and the matrix products are those of SciPy's BLAS. The arithmetic is that of `learner.update.gradients` and of
+PyTorch's Adam on the same memory, with equal results up to rounding.
+
+One shortcut: the gradient is non-zero only for the taken action, so the last layer's backward pass needs no matrix
+product.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,12 +18,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from actors.policy.mlp_kernels import Floats, Layers, best_action, forward, make_workspace, multiply, squared_norm
+from learner.config import RunConfig
 from learner.update.gradients import FlatNetwork
-from learner.update.updates import LearnerSettings, UpdateStats
+from learner.update.updates import UpdateStats
 from sim_core.jit import inlined, kernel
 
 
-class _Rows(NamedTuple):
+class _SuperBatch(NamedTuple):
     """Columns of a super-batch: states `[rows, size]`, the others `[rows]`."""
 
     s_tm1: Floats
@@ -33,34 +36,39 @@ class _Rows(NamedTuple):
 
 
 class _Flat(NamedTuple):
-    """The online network's parameters one after the other, what Adam keeps of each, and the target network's."""
+    """Flat arrays `[parameters]`: the online network, its gradients and Adam's moments, and the target network."""
 
     values: Floats
-    slopes: Floats
-    mean: Floats
-    square: Floats
+    grads: Floats
+    exp_avg: Floats
+    exp_avg_sq: Floats
     target: Floats
 
 
-class _Room(NamedTuple):
-    """Memory of one minibatch: states, hidden layers and action values `[batch, width]`, twice; `[batch]` twice."""
+class _Workspace(NamedTuple):
+    """Memory of one minibatch.
 
-    seen: tuple[Floats, ...]
+    `online` and `other` hold states, hidden layers and action values, `[batch, width]` each. `other` holds the
+    activations of the target network first, and then the gradients with respect to the online network's activations.
+    `td_target` `[batch]` are the TD targets, `grad` `[batch]` the gradient with respect to the taken action's value.
+    """
+
+    online: tuple[Floats, ...]
     other: tuple[Floats, ...]
-    goal: Floats
-    slope: Floats
+    td_target: Floats
+    grad: Floats
 
 
-class _Rule(NamedTuple):
-    """What the update is: settings of the run, and of PyTorch's Adam. A `soft_rate` of 0 is a copy now and then."""
+class _Hyperparameters(NamedTuple):
+    """What the kernel needs of the config and of PyTorch's Adam; `target_rate` 0 copies the target by the interval."""
 
     double: bool
     huber: bool
     max_norm: float
-    interval: int
-    soft_rate: float
-    beta_mean: float
-    beta_square: float
+    target_interval: int
+    target_rate: float
+    beta1: float
+    beta2: float
     epsilon: float
 
 
@@ -68,49 +76,52 @@ class CompiledUpdates:
     """Updates of a plain network on the CPU (see `Updates`).
 
     Args:
-      online, target: the networks, whose memory is changed.
-      optimiser: Adam over the online network's flat parameters; its state is kept as it would keep it.
-      settings: of the learner.
+      online, target: the networks; their memory is changed in place.
+      optimiser: Adam over the online network's flat parameters; its state is updated as Adam would do it.
+      config: of the run.
     """
 
     def __init__(
-        self, online: FlatNetwork, target: FlatNetwork, optimiser: torch.optim.Adam, settings: LearnerSettings
+        self, online: FlatNetwork, target: FlatNetwork, optimiser: torch.optim.Adam, config: RunConfig
     ) -> None:
         self._online, self._target, self._optimiser = online, target, optimiser
         self._layers, self._target_layers = _arrays(online.layers), _arrays(target.layers)
-        self._slopes = _arrays(online.gradients)
-        self._size = settings.batch_size
+        self._grads = _arrays(online.grads)
+        self._size = config.batch_size
         group = optimiser.param_groups[0]
-        self._rule = _Rule(
-            settings.double,
-            settings.loss == "huber",
-            settings.max_gradient_norm,
-            settings.target_update_interval,
-            settings.soft_target_rate or 0.0,
-            group["betas"][0],
-            group["betas"][1],
-            group["eps"],
+        self._hyper = _Hyperparameters(
+            double=config.algorithm == "double_dqn",
+            huber=config.loss == "huber",
+            max_norm=config.max_gradient_norm,
+            target_interval=config.target_update_interval,
+            target_rate=config.target_update_rate if config.target_update == "soft" else 0.0,
+            beta1=group["betas"][0],
+            beta2=group["betas"][1],
+            epsilon=group["eps"],
         )
-        seen, other = (make_workspace(self._size, self._layers) for _ in range(2))
-        self._room = _Room(seen, other, *np.zeros((2, self._size), np.float32))
+        activations, other = (make_workspace(self._size, self._layers) for _ in range(2))
+        self._workspace = _Workspace(activations, other, *np.zeros((2, self._size), np.float32))
         self._compile()
 
     def _compile(self) -> None:
-        """Compiles for this number of layers, or loads what was compiled, before anybody waits for an update."""
+        """Compiles the kernel for this number of layers, or loads it, before anybody waits for an update."""
         states, column = np.zeros((0, 0), np.float32), np.zeros(0, np.float32)
-        rows = _Rows(states, np.zeros(0, np.int64), column, column, states, column)
-        self._run(rows, _Flat(column, column, column, column, column), 0.0, 0, 0.0, column)
+        batch = _SuperBatch(states, np.zeros(0, np.int64), column, column, states, column)
+        self._run(batch, _Flat(column, column, column, column, column), 0.0, 0, 0.0, column)
 
-    def _run(self, rows: _Rows, flat: _Flat, learning_rate: float, updates: int, steps: float, errors: Floats) -> Any:
+    def _run(
+        self, batch: _SuperBatch, flat: _Flat, learning_rate: float, updates: int, steps: float, td_errors: Floats
+    ) -> NDArray[np.float64]:
         sums = np.zeros(3)
-        networks = (self._layers, self._target_layers, self._slopes)
-        _updates(rows, *networks, flat, self._room, self._rule, learning_rate, updates, steps, errors, sums)
+        networks = (self._layers, self._target_layers, self._grads)
+        workspace, hyper = self._workspace, self._hyper
+        _updates(batch, *networks, flat, workspace, hyper, learning_rate, updates, steps, td_errors, sums)
         return sums
 
     def __call__(self, columns: dict[str, Tensor], learning_rate: float, updates: int) -> tuple[UpdateStats, Floats]:
         """See `Updates`."""
         state = self._state()
-        rows = _Rows(
+        batch = _SuperBatch(
             s_tm1=columns["observation"].flatten(1).numpy(),
             a_tm1=columns["action"].numpy(),
             r_t=columns["reward"].numpy(),
@@ -118,18 +129,18 @@ class CompiledUpdates:
             s_t=columns["next_observation"].flatten(1).numpy(),
             weight=columns["weight"].numpy() if "weight" in columns else np.ones(len(columns["action"]), np.float32),
         )
-        gradient = self._online.values.grad
-        assert gradient is not None
-        tensors = (self._online.values, gradient, state["exp_avg"], state["exp_avg_sq"], self._target.values)
-        errors = np.empty(len(rows.a_tm1), np.float32)
+        grad = self._online.values.grad
+        assert grad is not None
+        tensors = (self._online.values, grad, state["exp_avg"], state["exp_avg_sq"], self._target.values)
+        td_errors = np.empty(len(batch.a_tm1), np.float32)
         flat = _Flat(*(tensor.detach().numpy() for tensor in tensors))
-        count = len(errors) // self._size
-        sums = self._run(rows, flat, learning_rate, updates, float(state["step"]), errors)
+        count = len(td_errors) // self._size
+        sums = self._run(batch, flat, learning_rate, updates, float(state["step"]), td_errors)
         state["step"] += count
-        return UpdateStats(*(sums / count).tolist()), errors
+        return UpdateStats(*(sums / count).tolist()), td_errors
 
     def _state(self) -> dict[str, Tensor]:
-        """Adam's state of the parameters, as PyTorch's begins it."""
+        """Adam's state of the parameters, initialised as PyTorch does it."""
         values = self._online.values
         state: dict[str, Tensor] = self._optimiser.state[values]
         if not state:
@@ -145,126 +156,144 @@ def _arrays(layers: list[tuple[Tensor, Tensor]]) -> Layers:
 
 @kernel
 def _updates(
-    rows: _Rows,
+    batch: _SuperBatch,
     online: Layers,
     target: Layers,
-    slopes: Layers,
+    grads: Layers,
     flat: _Flat,
-    room: _Room,
-    rule: _Rule,
+    workspace: _Workspace,
+    hyper: _Hyperparameters,
     learning_rate: float,
     updates: int,
     steps: float,
-    errors: Floats,
+    td_errors: Floats,
     sums: NDArray[np.float64],
 ) -> None:
-    """Makes an update of each minibatch in turn; `errors` take the TD errors, `sums` loss, mean value, mean error."""
-    size = len(room.goal)
-    for start in range(0, len(errors), size):
-        _goals(rows, start, online, target, room, rule.double)
-        _values(rows.s_tm1, start, online, room.seen)
-        _losses(rows, start, room, rule.huber, errors, sums)
-        _gradients(rows.a_tm1, start, online, slopes, room)
+    """Makes one update of each minibatch in turn.
+
+    Args:
+      batch: minibatch after minibatch.
+      online, target, grads: views of `flat`, layer by layer.
+      flat: see _Flat; changed in place.
+      workspace: see _Workspace.
+      hyper: see _Hyperparameters.
+      learning_rate: Adam's.
+      updates, steps: updates of the learner, and steps of Adam, before this call.
+      td_errors: receives the TD errors `[rows]`, each before its update.
+      sums: the sums of loss, mean action value and mean absolute TD error over the minibatches are added to it.
+    """
+    size = len(workspace.td_target)
+    for start in range(0, len(td_errors), size):
+        _td_targets(batch, start, online, target, workspace, hyper.double)
+        _forward(batch.s_tm1, start, online, workspace.online)
+        _losses(batch, start, workspace, hyper.huber, td_errors, sums)
+        _backward(batch.a_tm1, start, online, grads, workspace)
         updates, steps = updates + 1, steps + 1.0
-        _adam(flat, rule, learning_rate, steps)
-        if rule.soft_rate > 0:
-            _follow(flat.target, flat.values, np.float32(rule.soft_rate))
-        elif updates % rule.interval == 0:
-            _follow(flat.target, flat.values, np.float32(1))
+        _adam_step(flat, hyper, learning_rate, steps)
+        if hyper.target_rate > 0:
+            _polyak(flat.target, flat.values, np.float32(hyper.target_rate))
+        elif updates % hyper.target_interval == 0:
+            _polyak(flat.target, flat.values, np.float32(1))
 
 
 @inlined
-def _values(states: Floats, start: int, layers: Layers, room: tuple[Floats, ...]) -> None:
-    """Writes a minibatch's states, hidden layers and action values to `room`."""
-    for row in range(room[0].shape[0]):
-        for column in range(room[0].shape[1]):
-            room[0][row, column] = states[start + row, column]
-    forward(layers, room)
+def _forward(states: Floats, start: int, layers: Layers, activations: tuple[Floats, ...]) -> None:
+    """Copies a minibatch's states to `activations[0]`, and computes all layers from them."""
+    for row in range(activations[0].shape[0]):
+        for column in range(activations[0].shape[1]):
+            activations[0][row, column] = states[start + row, column]
+    forward(layers, activations)
 
 
 @inlined
-def _goals(rows: _Rows, start: int, online: Layers, target: Layers, room: _Room, double: bool) -> None:
-    """Writes what the taken actions' values should be (see `double_q_target`, `q_target`)."""
-    _values(rows.s_t, start, target, room.other)
-    q_t = room.other[-1]
-    chooser = q_t
+def _td_targets(
+    batch: _SuperBatch, start: int, online: Layers, target: Layers, workspace: _Workspace, double: bool
+) -> None:
+    """Writes the TD targets of a minibatch (see `learner.update.double_dqn.td_targets`)."""
+    _forward(batch.s_t, start, target, workspace.other)
+    q_t = workspace.other[-1]
+    selector = q_t
     if double:
-        _values(rows.s_t, start, online, room.seen)
-        chooser = room.seen[-1]
-    for row in range(len(room.goal)):
-        best = best_action(chooser, row)
-        room.goal[row] = rows.r_t[start + row] + rows.discount_t[start + row] * q_t[row, best]
+        _forward(batch.s_t, start, online, workspace.online)
+        selector = workspace.online[-1]
+    for row in range(len(workspace.td_target)):
+        best = best_action(selector, row)
+        workspace.td_target[row] = batch.r_t[start + row] + batch.discount_t[start + row] * q_t[row, best]
 
 
 @inlined
-def _losses(rows: _Rows, start: int, room: _Room, huber: bool, errors: Floats, sums: NDArray[np.float64]) -> None:
-    """Writes TD errors, and the mean loss's slope by each taken action's value (see `mean_loss`)."""
-    q_tm1, size = room.seen[-1], len(room.goal)
+def _losses(
+    batch: _SuperBatch, start: int, workspace: _Workspace, huber: bool, td_errors: Floats, sums: NDArray[np.float64]
+) -> None:
+    """Writes TD errors, and the gradient of the mean loss (see `mean_loss`) w.r.t. the taken actions' values."""
+    q_tm1, size = workspace.online[-1], len(workspace.td_target)
     one, half, two = np.float32(1), np.float32(0.5), np.float32(2)
-    loss, value, size_of_error = 0.0, 0.0, 0.0
+    loss_sum, value_sum, error_sum = 0.0, 0.0, 0.0
     for row in range(size):
-        error = room.goal[row] - q_tm1[row, rows.a_tm1[start + row]]
-        weight = rows.weight[start + row]
+        td_error = workspace.td_target[row] - q_tm1[row, batch.a_tm1[start + row]]
+        weight = batch.weight[start + row]
         if huber:
-            slope = one if error > one else (-one if error < -one else error)
-            lost = slope * (error - half * slope)
+            grad = one if td_error > one else (-one if td_error < -one else td_error)
+            loss = grad * (td_error - half * grad)
         else:
-            slope = two * error
-            lost = error * error
-        loss += weight * lost
-        room.slope[row] = -weight * slope / np.float32(size)
-        size_of_error += abs(error)
-        errors[start + row] = error
+            grad = two * td_error
+            loss = td_error * td_error
+        loss_sum += weight * loss
+        workspace.grad[row] = -weight * grad / np.float32(size)
+        error_sum += abs(td_error)
+        td_errors[start + row] = td_error
         for action in range(q_tm1.shape[1]):
-            value += q_tm1[row, action]
-    sums[0] += loss / size
-    sums[1] += value / q_tm1.size
-    sums[2] += size_of_error / size
+            value_sum += q_tm1[row, action]
+    sums[0] += loss_sum / size
+    sums[1] += value_sum / q_tm1.size
+    sums[2] += error_sum / size
 
 
 @inlined
-def _gradients(actions: NDArray[np.int64], start: int, online: Layers, slopes: Layers, room: _Room) -> None:
-    """Back-propagates `room.slope`; the loss's derivatives by the hidden layers go to `room.other`."""
+def _backward(actions: NDArray[np.int64], start: int, online: Layers, grads: Layers, workspace: _Workspace) -> None:
+    """Backpropagates `workspace.grad` to `grads`; the hidden layers' gradients go to `workspace.other`."""
     last = len(online.weights) - 1
-    _head_gradients(actions, start, online, slopes, room)
+    _head_backward(actions, start, online, grads, workspace)
     for i in range(last - 1, -1, -1):
-        delta, inputs = room.other[i + 1], room.seen[i]
-        _add_up(delta, slopes.biases[i])
-        multiply(delta.T, inputs, slopes.weights[i])
+        delta, inputs = workspace.other[i + 1], workspace.online[i]
+        _sum_rows(delta, grads.biases[i])
+        multiply(delta.T, inputs, grads.weights[i])
         if i > 0:
-            multiply(delta, online.weights[i], room.other[i])
-            _stop_where_idle(room.other[i], inputs)
+            multiply(delta, online.weights[i], workspace.other[i])
+            _relu_backward(workspace.other[i], inputs)
 
 
 @inlined
-def _head_gradients(actions: NDArray[np.int64], start: int, online: Layers, slopes: Layers, room: _Room) -> None:
-    """The last layer's gradients, and the derivatives by its inputs."""
+def _head_backward(
+    actions: NDArray[np.int64], start: int, online: Layers, grads: Layers, workspace: _Workspace
+) -> None:
+    """Writes the last layer's gradients, and the gradient with respect to its inputs."""
     last = len(online.weights) - 1
-    weight, weight_slope, bias_slope = online.weights[last], slopes.weights[last], slopes.biases[last]
-    inputs, delta = room.seen[last], room.other[last]
-    weight_slope[:] = np.float32(0)
-    bias_slope[:] = np.float32(0)
+    weight, weight_grad, bias_grad = online.weights[last], grads.weights[last], grads.biases[last]
+    inputs, delta = workspace.online[last], workspace.other[last]
+    weight_grad[:] = np.float32(0)
+    bias_grad[:] = np.float32(0)
     for row in range(inputs.shape[0]):
-        slope, action = room.slope[row], actions[start + row]
-        bias_slope[action] += slope
+        grad, action = workspace.grad[row], actions[start + row]
+        bias_grad[action] += grad
         for column in range(inputs.shape[1]):
-            weight_slope[action, column] += slope * inputs[row, column]
-            delta[row, column] = slope * weight[action, column]
-    _stop_where_idle(delta, inputs)
+            weight_grad[action, column] += grad * inputs[row, column]
+            delta[row, column] = grad * weight[action, column]
+    _relu_backward(delta, inputs)
 
 
 @inlined
-def _stop_where_idle(delta: Floats, inputs: Floats) -> None:
-    """Zero where the hidden unit is at its zero: ReLU's slope."""
+def _relu_backward(delta: Floats, activations: Floats) -> None:
+    """Zeroes the gradient `delta`, in place, where ReLU is inactive."""
     zero = np.float32(0)
     for row in range(delta.shape[0]):
         for column in range(delta.shape[1]):
-            delta[row, column] = zero if inputs[row, column] <= zero else delta[row, column]
+            delta[row, column] = zero if activations[row, column] <= zero else delta[row, column]
 
 
 @inlined
-def _add_up(delta: Floats, total: Floats) -> None:
-    """The sum over rows."""
+def _sum_rows(delta: Floats, total: Floats) -> None:
+    """Writes the sum of `delta` `[batch, width]` over the batch to `total` `[width]`."""
     total[:] = np.float32(0)
     for row in range(delta.shape[0]):
         for column in range(delta.shape[1]):
@@ -272,27 +301,27 @@ def _add_up(delta: Floats, total: Floats) -> None:
 
 
 @inlined
-def _adam(flat: _Flat, rule: _Rule, learning_rate: float, steps: float) -> None:
-    """Scales the gradients down to `max_norm`, as PyTorch does, and makes Adam's step of them."""
+def _adam_step(flat: _Flat, hyper: _Hyperparameters, learning_rate: float, steps: float) -> None:
+    """Clips the gradients to `max_norm`, as PyTorch does, and makes Adam's step (Kingma and Ba 2015, Algorithm 1)."""
     one = np.float32(1)
-    norm = np.sqrt(squared_norm(flat.slopes))
-    scale = np.float32(rule.max_norm) / (norm + np.float32(1e-6))
+    norm = np.sqrt(squared_norm(flat.grads))
+    scale = np.float32(hyper.max_norm) / (norm + np.float32(1e-6))
     scale = one if scale > one else scale
-    share_mean, share_square = np.float32(1 - rule.beta_mean), np.float32(1 - rule.beta_square)
-    length = np.float32(learning_rate / (1 - rule.beta_mean**steps))
-    root = np.float32(np.sqrt(1 - rule.beta_square**steps))
-    epsilon = np.float32(rule.epsilon)
-    for i in range(len(flat.slopes)):
-        slope = flat.slopes[i] * scale
-        flat.slopes[i] = slope
-        flat.mean[i] += share_mean * (slope - flat.mean[i])
-        flat.square[i] += share_square * (slope * slope - flat.square[i])
-        flat.values[i] -= length * flat.mean[i] / (np.sqrt(flat.square[i]) / root + epsilon)
+    weight1, weight2 = np.float32(1 - hyper.beta1), np.float32(1 - hyper.beta2)
+    step_size = np.float32(learning_rate / (1 - hyper.beta1**steps))
+    correction2_sqrt = np.float32(np.sqrt(1 - hyper.beta2**steps))
+    epsilon = np.float32(hyper.epsilon)
+    for i in range(len(flat.grads)):
+        grad = flat.grads[i] * scale
+        flat.grads[i] = grad
+        flat.exp_avg[i] += weight1 * (grad - flat.exp_avg[i])
+        flat.exp_avg_sq[i] += weight2 * (grad * grad - flat.exp_avg_sq[i])
+        flat.values[i] -= step_size * flat.exp_avg[i] / (np.sqrt(flat.exp_avg_sq[i]) / correction2_sqrt + epsilon)
 
 
 @inlined
-def _follow(target: Floats, online: Floats, rate: np.float32) -> None:
-    """Polyak's average; at rate 1 a copy."""
+def _polyak(target: Floats, online: Floats, rate: np.float32) -> None:
+    """Polyak averaging, in place: target = (1 - rate) target + rate online; rate 1 copies."""
     rest = np.float32(1) - rate
     for i in range(len(target)):
         target[i] = rest * target[i] + rate * online[i]

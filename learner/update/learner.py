@@ -10,68 +10,74 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from actors.policy.network import NETWORKS, WeightsSnapshot, snapshot
+from actors.rollout.vector_env import EnvShape
+from learner.config import RunConfig
 from learner.update.compiled_updates import CompiledUpdates
 from learner.update.gradients import FlatNetwork
-from learner.update.updates import LearnerSettings, TorchUpdates, Updates, UpdateStats
+from learner.update.updates import TorchUpdates, Updates, UpdateStats
 from sim_core.checks import require
 
-NAMES = ("reward", "discount", "action", "observation", "next_observation")
+COLUMNS = ("reward", "discount", "action", "observation", "next_observation")
 Rows = NDArray[Any] | dict[str, NDArray[Any]]
-"""Transitions, as rows of `actors.service.messages.transition_dtype` or as their columns by name."""
+"""Transitions: rows of `actors.service.messages.transition_dtype`, or their columns by name."""
 
 
 class Learner:
-    """Owns the networks and changes them; every update is one gradient step of one minibatch.
+    """Owns the networks and the optimiser; every update is one gradient step of one minibatch.
 
     Args:
-      settings: see LearnerSettings.
+      config: the run.
+      shape: spaces of its environment.
 
     Attributes:
+      online, target: the networks.
+      optimiser: Adam over the online network's parameters.
+      updates: made so far.
       td_errors: TD errors of the last call's rows, each before its update, `[rows]` float32.
 
     Raises:
-      ConfigError: the device is not there.
+      ConfigError: this machine has no such device.
     """
 
-    def __init__(self, settings: LearnerSettings) -> None:
+    def __init__(self, config: RunConfig, shape: EnvShape) -> None:
         with torch.random.fork_rng():
-            torch.manual_seed(settings.seed)
-            online = NETWORKS[settings.network](settings.observation_size, settings.hidden_sizes, settings.num_actions)
-        self.device = learning_device(settings.device)
+            torch.manual_seed(config.seed)
+            online = NETWORKS[config.network](shape.observation_size, config.hidden_sizes, shape.num_actions)
+        self.device = learning_device(config.device)
         self._online = FlatNetwork(online.to(self.device))
         self._target = self._online.copy()
         self.online, self.target = self._online.network, self._target.network
         self.optimiser = torch.optim.Adam([self._online.values], fused=True)
-        by_hand = settings.gradients == "by_hand"
-        compilable = by_hand and settings.network == "plain" and self.device.type == "cpu"
+        by_hand = config.gradients == "by_hand"
+        compilable = by_hand and config.network == "plain" and self.device.type == "cpu"
         kind = CompiledUpdates if compilable else TorchUpdates
-        self._updates_of: Updates = kind(self._online, self._target, self.optimiser, settings)
+        self._make_updates: Updates = kind(self._online, self._target, self.optimiser, config)
         self.updates = 0
-        self._batch_size = settings.batch_size
+        self._batch_size = config.batch_size
         self._columns = Columns()
         self.td_errors = np.zeros(0, np.float32)
 
     def update(self, rows: Rows, learning_rate: float, weights: NDArray[np.float32] | None = None) -> UpdateStats:
-        """One update per `batch_size` rows of `rows`, a whole multiple of it.
+        """Makes one update per minibatch of `batch_size` rows.
 
         Args:
-          rows: transitions (see Rows).
+          rows: a super-batch of transitions (see Rows), a multiple of `batch_size`.
           learning_rate: Adam's.
-          weights: what each row's loss counts, `[rows]`, None for 1.
+          weights: importance weights of the rows' losses, `[rows]`, None for 1.
         """
         columns = self._columns(rows)
         if weights is not None:
             columns["weight"] = torch.from_numpy(weights)
-        stats, self.td_errors = self._updates_of(columns, learning_rate, self.updates)
+        stats, self.td_errors = self._make_updates(columns, learning_rate, self.updates)
         self.updates += len(self.td_errors) // self._batch_size
         return stats
 
     def weights(self, time_s: float) -> WeightsSnapshot:
-        """The online network, for publication."""
+        """The online network's weights, published at `time_s`."""
         return snapshot(self.online, self.updates, time_s)
 
     def get_state(self) -> dict[str, Tensor]:
-        """All tensors that a checkpoint needs, by name."""
+        """A copy of all tensors that a checkpoint needs, by name."""
         state = {f"online.{name}": tensor for name, tensor in self.online.state_dict().items()}
         state |= {f"target.{name}": tensor for name, tensor in self.target.state_dict().items()}
         for name, tensor in self.optimiser.state.get(self._online.values, {}).items():
@@ -80,17 +86,17 @@ class Learner:
         return {name: tensor.detach().cpu().clone().contiguous() for name, tensor in state.items()}
 
     def set_state(self, state: dict[str, Tensor]) -> None:
-        """Takes up what `get_state` gave.
+        """Restores what `get_state` returned.
 
         Raises:
-          ValueError: the tensors are of a network of another shape.
+          ValueError: the tensors are those of a network of another shape.
         """
         try:
-            self.online.load_state_dict(_part(state, "online."))
-            self.target.load_state_dict(_part(state, "target."))
+            self.online.load_state_dict(_with_prefix(state, "online."))
+            self.target.load_state_dict(_with_prefix(state, "target."))
         except RuntimeError as error:
             raise ValueError(f"the saved networks have another shape: {str(error).splitlines()[-1].strip()}") from error
-        adam = _part(state, "optimiser.")
+        adam = _with_prefix(state, "optimiser.")
         saved = {0: adam} if adam else {}
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": saved, "param_groups": groups})
@@ -98,10 +104,10 @@ class Learner:
 
 
 def learning_device(name: Literal["auto", "cpu", "cuda"]) -> torch.device:
-    """The device that a config's `device` means on this machine.
+    """The device that the config's `device` means on this machine.
 
     Raises:
-      ConfigError: it is CUDA, and there is none.
+      ConfigError: it is CUDA, and this machine has none.
     """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
@@ -112,24 +118,25 @@ def learning_device(name: Literal["auto", "cpu", "cuda"]) -> torch.device:
     return torch.device(name)
 
 
-def _part(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def _with_prefix(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors whose names begin with `prefix`, under the rest of their names."""
     return {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
 
 
 class Columns:
-    """Columns of transitions as tensors: observations, rewards and discounts float32, actions int64.
+    """Converts transitions to columns of tensors: observations, rewards and discounts float32, actions int64.
 
-    A column that is so already is taken as it is. The others are written to memory that calls with as many rows share,
-    so that the tensors of one are overwritten by the next: a super-batch is megabytes, and to give memory back and take
-    it anew with every call costs more than what is written to it.
+    A column that has its dtype already is not copied. The others are copied to buffers that all calls of the same
+    number of rows share, so a call overwrites the tensors of the call before. A super-batch is megabytes; allocating
+    them anew in every call would cost more than the copy.
     """
 
     def __init__(self) -> None:
         self._tensors: dict[str, Tensor] = {}
 
     def __call__(self, rows: Rows) -> dict[str, Tensor]:
-        """The columns of `rows`, `[count, ...]` each."""
-        return {name: self._column(name, rows[name]) for name in NAMES}
+        """The columns of `rows`, `[rows, ...]` each."""
+        return {name: self._column(name, rows[name]) for name in COLUMNS}
 
     def _column(self, name: str, column: NDArray[Any]) -> Tensor:
         wanted = np.int64 if name == "action" else np.float32

@@ -1,9 +1,10 @@
-"""What runs in the learner's process: sample, update, publish; and the shards that are embedded there."""
+"""The node of the learner: it samples, updates, publishes weights, and may embed the replay shards."""
 
 from __future__ import annotations
 
 import time
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -13,26 +14,31 @@ from safetensors.torch import load_file, save_file
 
 from actors.policy.network import WeightsSnapshot
 from actors.replay.node import ShardNode
+from actors.rollout.vector_env import EnvShape
 from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind
-from actors.service.messages import STORES, WAITS, AddReply, Delivered, Draws, SampleReply, TransitionBlock
-from actors.service.rpc import Calls, Node, Ref
+from actors.service.messages import STORES, WAITS, AddReply, Delivered, Draws, TransitionBlock
+from actors.service.rpc import Calls, Handle, Ref
 from actors.service.stopwatch import Stopwatch
 from actors.storage.fragment_writer import FragmentWriter, WriteResult, join_results
 from actors.storage.uri import Location, fetched, join_location
+from learner.config import RunConfig
 from learner.update.double_dqn import importance_weights
 from learner.update.learner import Learner
-from learner.update.prefetch import DrawAhead, DrawWhenAsked
-from learner.update.updates import LearnerSettings, UpdateStats
+from learner.update.prefetch import NoPrefetch, Prefetch
+from learner.update.updates import UpdateStats
 
-SLOW_CALL_S = 3_600.0
+T = TypeVar("T")
+
+LOAD_TIMEOUT_S = 3_600.0
+"""Most time that a shard may take to load its rows; whoever loads the learner has a deadline of its own."""
 SAMPLES, UPDATES, PUBLISHES = "samples", "updates", "publishes"
-"""The learner waits for its shards' rows, makes updates of them, hands out TD errors and weights."""
+"""What the learner's time goes to, besides STORES and WAITS: rows to sample, updates, TD errors and weights to send."""
 WEIGHTS = "learner.safetensors"
 """File of networks and optimiser in a checkpoint."""
 
 
 class UpdateReport(NamedTuple):
-    """What a call of updates gives back: their means, and the version reached.
+    """Result of a call of `LearnerNode.update`: means over its updates, and the version of the weights that it reached.
 
     `seconds` says where the learner's time went since its last report (see SAMPLES, UPDATES, PUBLISHES, STORES, WAITS).
     """
@@ -43,10 +49,11 @@ class UpdateReport(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """A super-batch: columns of transitions `[count, ...]`, and of prioritised ones also how they were drawn.
+    """A super-batch: the minibatches of one call of updates, one after the other.
 
-    `shard` `[count]` is the shard that each came from, None where there is one; `draws.probability` is among the rows
-    of all shards.
+    `columns` are those of the transitions `[count, ...]`. `shard` `[count]` is the index of the shard that each row
+    came from, None if there is only one. `draws` tells how prioritised rows were drawn, with probabilities among the
+    rows of all shards; None if all rows are drawn alike.
     """
 
     columns: dict[str, NDArray[Any]]
@@ -55,87 +62,95 @@ class Sample(NamedTuple):
 
 
 class LearnerNode:
-    """The learner with its replay shards, in this process or elsewhere.
+    """The learner with its replay shards, which it embeds or which are nodes of their own.
 
     Args:
-      settings: see LearnerSettings.
-      shards: nodes with `sample`, `set_priorities`, `publish`, `mass`, `save`, `saved`, `load`.
-      shard_calls: how to call the shards.
-      draws_ahead: whether the rows of the next call of updates are drawn during this one, in another thread.
+      config: the run.
+      shape: spaces of its environment.
+      shards: where to sample from.
+      calls: how to call the shards.
+      prefetch: whether the rows of the next call of updates are drawn during this one (see `Prefetch`).
     """
 
     def __init__(
-        self, settings: LearnerSettings, shards: list[Node], shard_calls: Calls, draws_ahead: bool = False
+        self,
+        config: RunConfig,
+        shape: EnvShape,
+        shards: Sequence[Handle[ShardNode]],
+        calls: Calls,
+        prefetch: bool = False,
     ) -> None:
         torch.set_num_threads(1)
-        self._settings = settings
-        self._learner = Learner(settings)
+        self._batch_size = config.batch_size
+        self._learner = Learner(config, shape)
         self._shards = list(shards)
         self._shard_incarnations = [0] * len(shards)
-        self._shard_calls = shard_calls
-        self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence((settings.seed, 1))))
+        self._calls = calls
+        self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence((config.seed, 1))))
         self._masses = np.zeros(len(shards), np.float64)
-        self._answers: dict[int, Ref] = {}
-        self._samples = DrawAhead(self._sample) if draws_ahead else DrawWhenAsked(self._sample)
+        self._priority_updates: dict[int, Ref[float]] = {}
+        self._samples = Prefetch(self._sample) if prefetch else NoPrefetch(self._sample)
         self._writer = FragmentWriter()
         self._watch = Stopwatch()
         self.publish()
 
     def add(self, block: TransitionBlock) -> AddReply:
-        """Stores a block in an embedded shard, each in turn."""
+        """Stores a block in one of the embedded shards, in turn (see `PushTarget`)."""
         self._watch.lap(WAITS)
-        shard: ShardNode = self._shards[block.header.sequence % len(self._shards)]
-        reply = shard.add(block)
+        shard = self._shards[block.header.sequence % len(self._shards)]
+        reply = self._calls.get(self._calls.start(shard, ShardNode.add, block))
         self._watch.lap(STORES)
         return reply
 
     def fence(self, worker_id: int, closed: int, incarnation: int) -> Delivered:
-        """Fences a worker in all embedded shards (see `ShardNode.fence`); returns what they hold together."""
-        parts: list[Delivered] = [shard.fence(worker_id, closed, incarnation) for shard in self._shards]
-        rows, env_steps, episodes, made = zip(*parts, strict=True)
+        """Fences a worker in all embedded shards; returns what they have stored together (see `PushTarget`)."""
+        refs = [self._calls.start(shard, ShardNode.fence, worker_id, closed, incarnation) for shard in self._shards]
+        rows, env_steps, episodes, made = zip(*map(self._calls.get, refs), strict=True)
         return Delivered(sum(rows), sum(env_steps), sum(episodes), max(made))
 
-    def replace_shard(self, index: int, shard: Node, incarnation: int) -> None:
-        """Samples from `shard`, which is empty, in the place of the shard of this index."""
+    def replace_shard(self, index: int, shard: Handle[ShardNode], incarnation: int) -> None:
+        """Samples from `shard`, which is empty and of this incarnation, in place of the shard of this index."""
         self._shards[index], self._shard_incarnations[index] = shard, incarnation
         self._masses[index] = 0.0
-        self._answers.pop(index, None)
+        self._priority_updates.pop(index, None)
         self._samples.drop()
-        self._shard_calls.start(shard, "publish", self._weights)
+        self._calls.start(shard, ShardNode.publish, self._weights)
 
-    def _result(self, index: int, ref: Ref) -> Any:
-        """What a call of the shard of this index gave.
+    def _result(self, index: int, ref: Ref[T]) -> T:
+        """The result of a call of the shard of this index.
 
         Raises:
-          ComponentFailed: the shard failed; nothing has been learned meanwhile.
+          ComponentFailed: the shard failed; no update has been made since the call.
         """
         try:
-            return self._shard_calls.get(ref)
+            return self._calls.get(ref)
         except CallFailed as failure:
-            part = Component(ComponentKind.SHARD, index)
-            raise ComponentFailed(part, self._shard_incarnations[index], failure.fault, failure.reason) from failure
-
-    def _slow_result(self, index: int, ref: Ref) -> Any:
-        """`_result` of a call that reads a whole shard; the caller's deadline is for all of them."""
-        self._shard_calls.wait([ref], SLOW_CALL_S)
-        return self._result(index, ref)
+            raise failure.of(Component(ComponentKind.SHARD, index), self._shard_incarnations[index]) from failure
 
     def update(self, updates: int, learning_rate: float, importance_exponent: float = 1.0) -> UpdateReport:
         """Samples a super-batch, makes `updates` updates of it, and publishes the weights.
 
-        Of prioritised shards the sample is weighted, and the TD errors go back to the shards that it came from.
+        With prioritised shards, the sample is weighted and its TD errors go back to the shards that it came from.
+
+        Args:
+          updates: how many, one minibatch each.
+          learning_rate: Adam's.
+          importance_exponent: beta of the importance weights (prioritised shards only).
+
+        Raises:
+          ComponentFailed: a shard failed, and no update was made.
         """
         self._watch.lap(WAITS)
-        count = updates * self._settings.batch_size
+        count = updates * self._batch_size
         sample, weights = self._samples.take(count), None
         self._watch.lap(SAMPLES)
         if sample.draws is not None:
-            weights = importance_weights(sample.draws.probability, self._settings.batch_size, importance_exponent)
+            weights = importance_weights(sample.draws.probability, self._batch_size, importance_exponent)
         self._samples.begin(count)
         stats = self._learner.update(sample.columns, learning_rate, weights)
         self._watch.lap(UPDATES)
         if sample.draws is not None:
-            self._answer(sample)
+            self._update_priorities(sample)
         self.publish()
         self._watch.lap(PUBLISHES)
         self._samples.settle()
@@ -143,56 +158,58 @@ class LearnerNode:
         return UpdateReport(stats, self._learner.updates, self._watch.take())
 
     def publish(self) -> None:
-        """Shares the newest weights with all shards, whose replies carry them to the workers."""
+        """Sends the newest weights to all shards, whose replies to pushes carry them on to the rollout workers."""
         self._weights = self._learner.weights(time.time())
         for shard in self._shards:
-            self._shard_calls.start(shard, "publish", self._weights)
+            self._calls.start(shard, ShardNode.publish, self._weights)
 
     def _sample(self, count: int) -> Sample:
-        """Draws rows from the shards in proportion to their masses, in random order."""
-        self._take_answers()
+        """Draws `count` rows from the shards in proportion to their masses, in random order."""
+        self._await_priority_updates()
         if len(self._shards) == 1:
-            reply: SampleReply = self._result(0, self._shard_calls.start(self._shards[0], "sample", count))
+            reply = self._result(0, self._calls.start(self._shards[0], ShardNode.sample, count))
             return Sample(reply.columns, None, reply.draws)
         if not self._masses.all():
-            self._masses[:] = self._ask_all("mass")
+            masses = [self._calls.start(shard, ShardNode.mass) for shard in self._shards]
+            self._masses[:] = [self._result(i, ref) for i, ref in enumerate(masses)]
         chances = self._masses / self._masses.sum()
         shares = self._rng.multinomial(count, chances)
-        asked = np.flatnonzero(shares)  # a shard may still be empty
-        refs = [self._shard_calls.start(self._shards[i], "sample", int(shares[i])) for i in asked]
-        replies = [self._result(i, ref) for i, ref in zip(asked.tolist(), refs, strict=True)]
-        self._masses[asked] = [reply.mass for reply in replies]
+        drawn = np.flatnonzero(shares)  # a shard may still be empty
+        refs = [self._calls.start(self._shards[i], ShardNode.sample, int(shares[i])) for i in drawn]
+        replies = [self._result(i, ref) for i, ref in zip(drawn.tolist(), refs, strict=True)]
+        self._masses[drawn] = [reply.mass for reply in replies]
         order = self._rng.permutation(count)
         columns = {
             name: np.concatenate([reply.columns[name] for reply in replies])[order] for name in replies[0].columns
         }
-        drawn = [(chances[i], reply.draws) for i, reply in zip(asked, replies, strict=True) if reply.draws is not None]
-        if not drawn:
+        draws = [(chances[i], reply.draws) for i, reply in zip(drawn, replies, strict=True) if reply.draws is not None]
+        if not draws:
             return Sample(columns, None, None)
-        number = np.concatenate([draws.insertion_index for _, draws in drawn])[order]
-        probability = np.concatenate([chance * draws.probability for chance, draws in drawn])[order]
-        return Sample(columns, np.repeat(asked, shares[asked])[order], Draws(number, probability))
+        number = np.concatenate([each.insertion_index for _, each in draws])[order]
+        probability = np.concatenate([chance * each.probability for chance, each in draws])[order]
+        return Sample(columns, np.repeat(drawn, shares[drawn])[order], Draws(number, probability))
 
-    def _answer(self, sample: Sample) -> None:
+    def _update_priorities(self, sample: Sample) -> None:
         """Sends the TD errors of the updates to the shards that their rows came from."""
         assert sample.draws is not None
         for i in np.unique(sample.shard) if sample.shard is not None else [0]:
-            mine = slice(None) if sample.shard is None else sample.shard == i
-            answer = (sample.draws.insertion_index[mine], self._learner.td_errors[mine])
-            self._answers[int(i)] = self._shard_calls.start(self._shards[i], "set_priorities", *answer)
+            rows = slice(None) if sample.shard is None else sample.shard == i
+            numbers, td_errors = sample.draws.insertion_index[rows], self._learner.td_errors[rows]
+            ref = self._calls.start(self._shards[i], ShardNode.set_priorities, numbers, td_errors)
+            self._priority_updates[int(i)] = ref
 
-    def _take_answers(self) -> None:
-        """Waits until the shards have taken the last call's TD errors, which may have failed there."""
-        while self._answers:
-            i, ref = self._answers.popitem()
+    def _await_priority_updates(self) -> None:
+        """Waits until the shards have set the last call's priorities.
+
+        Raises:
+          ComponentFailed: a shard has not.
+        """
+        while self._priority_updates:
+            i, ref = self._priority_updates.popitem()
             self._masses[i] = self._result(i, ref)
 
-    def _ask_all(self, method: str) -> list[Any]:
-        refs = [self._shard_calls.start(shard, method) for shard in self._shards]
-        return [self._result(i, ref) for i, ref in enumerate(refs)]
-
-    def save(self, folder: Location) -> dict[str, Any]:
-        """Starts to write learner and shards, as they are now, into `folder`; `saved` tells of its end.
+    def save(self, location: Location) -> dict[str, Any]:
+        """Starts to write learner and shards, as they are now, to the folder `location`; `saved` tells how that ended.
 
         Returns:
           The rest of their state, for JSON.
@@ -200,26 +217,26 @@ class LearnerNode:
         Raises:
           ComponentFailed: a shard failed.
         """
-        self._take_answers()
+        self._await_priority_updates()
         tensors = self._learner.get_state()
-        self._writer.start(join_location(folder, WEIGHTS), lambda path: save_file(tensors, str(path)))
+        self._writer.start(join_location(location, WEIGHTS), lambda path: save_file(tensors, str(path)))
         refs = [
-            self._shard_calls.start(shard, "save", _shard_folder(folder, i)) for i, shard in enumerate(self._shards)
+            self._calls.start(shard, ShardNode.save, _shard_folder(location, i)) for i, shard in enumerate(self._shards)
         ]
         shards = [self._result(i, ref) for i, ref in enumerate(refs)]
         return {"shards": shards, "rng": self._rng.bit_generator.state, "sizes": self._masses.tolist()}
 
     def saved(self, timeout_s: float = 0.0) -> WriteResult | None:
-        """How the last `save` ended, all shards included; None while something of it is being written.
+        """How the last `save` ended, shards included; None while any fragment of it is still being written.
 
         Args:
-          timeout_s: how long to wait for each.
+          timeout_s: how long to wait for each fragment.
 
         Raises:
-          ComponentFailed: a shard failed, and the others have written.
+          ComponentFailed: a shard failed, and all others have ended their writing.
         """
         parts, failures = [self._writer.result(timeout_s)], []
-        refs = [self._shard_calls.start(shard, "saved", timeout_s) for shard in self._shards]
+        refs = [self._calls.start(shard, ShardNode.saved, timeout_s) for shard in self._shards]
         for i, ref in enumerate(refs):
             try:
                 parts.append(self._result(i, ref))
@@ -230,28 +247,30 @@ class LearnerNode:
             raise failures[0]
         return written
 
-    def load(self, folder: Location, state: dict[str, Any]) -> None:
-        """Takes up what `save` wrote and returned; publishes the weights (see `publish`).
+    def load(self, location: Location, state: dict[str, Any]) -> None:
+        """Restores what `save` wrote and returned, and publishes the weights.
 
         Raises:
           ValueError: the files are damaged or do not fit this run.
+          ComponentFailed: a shard failed.
         """
-        location = join_location(folder, WEIGHTS)
+        file = join_location(location, WEIGHTS)
         try:
-            with fetched(location) as path:
+            with fetched(file) as path:
                 self._learner.set_state(load_file(str(path)))
         except (SafetensorError, OSError, KeyError) as error:
-            raise ValueError(f"{location} cannot be read ({error})") from error
+            raise ValueError(f"{file} cannot be read ({error})") from error
         if len(state["shards"]) != len(self._shards):
             raise ValueError(f"the checkpoint has {len(state['shards'])} shards, this run {len(self._shards)}")
         refs = [
-            self._shard_calls.start(shard, "load", _shard_folder(folder, i), shard_state)
+            self._calls.start(shard, ShardNode.load, _shard_folder(location, i), shard_state)
             for i, (shard, shard_state) in enumerate(zip(self._shards, state["shards"], strict=True))
         ]
         for i, ref in enumerate(refs):
-            self._slow_result(i, ref)
+            self._calls.wait([ref], LOAD_TIMEOUT_S)
+            self._result(i, ref)
         self._rng.bit_generator.state = state["rng"]
-        self._answers.clear()
+        self._priority_updates.clear()
         self._samples.drop()
         self._masses[:] = state["sizes"]
         self.publish()
@@ -261,5 +280,5 @@ class LearnerNode:
         return self._weights
 
 
-def _shard_folder(folder: Location, shard: int) -> Location:
-    return join_location(folder, f"shard-{shard}.zarr")
+def _shard_folder(location: Location, shard: int) -> Location:
+    return join_location(location, f"shard-{shard}.zarr")

@@ -1,4 +1,4 @@
-"""Draws the rows of the next call of updates while the learner makes those of this one."""
+"""Prefetching: the rows of the next call of updates are drawn while the learner makes those of this one."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Generic, TypeVar
 Drawn = TypeVar("Drawn")
 
 
-class DrawAhead(Generic[Drawn]):
-    """Draws in a thread, one super-batch ahead.
+class Prefetch(Generic[Drawn]):
+    """Draws one super-batch ahead, in a thread.
 
-    Worth its while where shards are processes of their own: the learner need not wait for their answers. One that the
-    learner holds itself draws no faster so, as the threads share caches and memory. Priorities must be known before the
-    next draw, which therefore cannot be made ahead.
+    This pays where the shards are nodes of their own: the learner does not wait for their replies. Shards that the
+    learner embeds would draw no faster, since the threads share caches and memory. Prioritised shards cannot be
+    prefetched from: the next draw needs the priorities that this call of updates sets.
 
-    Rows that are stored during a call of updates can be drawn in the call after the next. Nothing is drawn but between
-    `begin` and `settle`, so that whoever stores or saves at another time has the shards for himself.
+    Rows that are stored during one call of updates can be drawn in the call after the next. No draw runs outside
+    `begin` ... `settle`, so whoever stores or saves at another time has exclusive access to the shards.
 
     Args:
-      draw: draws so many rows.
+      draw: draws a given number of rows.
     """
 
     def __init__(self, draw: Callable[[int], Drawn]) -> None:
@@ -29,29 +29,29 @@ class DrawAhead(Generic[Drawn]):
         self._next: tuple[int, Future[Drawn]] | None = None
 
     def begin(self, count: int) -> None:
-        """Begins to draw `count` rows for the next `take`."""
+        """Starts to draw `count` rows for the next `take`."""
         self._next = count, self._thread.submit(self._draw, count)
 
     def settle(self) -> None:
-        """Waits until what was begun is drawn, or cannot be."""
+        """Waits until the draw has ended, with or without an error."""
         if self._next is not None:
             wait([self._next[1]])
 
     def take(self, count: int) -> Drawn:
-        """`count` rows, drawn ahead if as many were; raises what drawing raised."""
+        """The prefetched rows if they are `count`, else `count` rows drawn now; raises what drawing them raised."""
         drawn, self._next = self._next, None
         return drawn[1].result() if drawn is not None and drawn[0] == count else self._draw(count)
 
     def drop(self) -> None:
-        """Forgets what was drawn, or why it could not be: the shards are others now."""
+        """Forgets the prefetched rows, or the error of drawing them: the shards have changed."""
         self._next = None
 
 
-class DrawWhenAsked(Generic[Drawn]):
-    """Draws only when rows are wanted, of all that is stored by then: the same rows whatever the threads do.
+class NoPrefetch(Generic[Drawn]):
+    """Draws when rows are wanted, from all that is stored by then: deterministic, whatever the threads do.
 
     Args:
-      draw: draws so many rows.
+      draw: draws a given number of rows.
     """
 
     def __init__(self, draw: Callable[[int], Drawn]) -> None:
@@ -61,7 +61,7 @@ class DrawWhenAsked(Generic[Drawn]):
         """Draws nothing."""
 
     def settle(self) -> None:
-        """There is nothing to wait for."""
+        """Waits for nothing."""
 
     def drop(self) -> None:
-        """There is nothing to forget."""
+        """Forgets nothing."""

@@ -1,42 +1,21 @@
-"""The updates of a super-batch, one gradient step a minibatch, by PyTorch on whatever device it has."""
+"""The updates of a call, one gradient step per minibatch; here by PyTorch, on whatever device it has."""
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from learner.update.double_dqn import LossName, as_batch
+from learner.config import RunConfig
+from learner.update.double_dqn import minibatch
 from learner.update.gradients import GRADIENTS, FlatNetwork
 
 
-class LearnerSettings(NamedTuple):
-    """What the learner needs to know of the run.
-
-    With a `soft_target_rate` the target network follows the online network after every update (Polyak's average),
-    without one it is copied every `target_update_interval`.
-    """
-
-    observation_size: int
-    num_actions: int
-    hidden_sizes: tuple[int, ...]
-    double: bool
-    batch_size: int
-    target_update_interval: int
-    max_gradient_norm: float
-    gradients: Literal["by_hand", "autograd"]
-    seed: int
-    network: Literal["plain", "dueling"]
-    loss: LossName
-    soft_target_rate: float | None
-    device: Literal["auto", "cpu", "cuda"]
-
-
 class UpdateStats(NamedTuple):
-    """Means over the updates of one call."""
+    """Means over the updates of one call: loss, action value, absolute TD error."""
 
     loss: float
     q_mean: float
@@ -49,10 +28,11 @@ class Updates(Protocol):
     def __call__(
         self, columns: dict[str, Tensor], learning_rate: float, updates: int
     ) -> tuple[UpdateStats, NDArray[np.float32]]:
-        """One update per `batch_size` rows, a whole multiple of it.
+        """One update per minibatch of `batch_size` rows.
 
         Args:
-          columns: of the packed transitions, `[rows, ...]` on the CPU; `weight` where losses do not count alike.
+          columns: of a super-batch, `[rows, ...]` on the CPU; rows is a multiple of `batch_size`. `weight` is missing
+            where all importance weights are 1.
           learning_rate: Adam's.
           updates: made before this call.
 
@@ -66,16 +46,17 @@ class TorchUpdates:
     """Updates by PyTorch (see `Updates`).
 
     Args:
-      online, target: the networks, whose memory is changed.
+      online, target: the networks; their memory is changed in place.
       optimiser: over the online network's flat parameters.
-      settings: of the learner.
+      config: of the run.
     """
 
     def __init__(
-        self, online: FlatNetwork, target: FlatNetwork, optimiser: torch.optim.Adam, settings: LearnerSettings
+        self, online: FlatNetwork, target: FlatNetwork, optimiser: torch.optim.Adam, config: RunConfig
     ) -> None:
-        self._online, self._target, self._optimiser, self._settings = online, target, optimiser, settings
-        self._gradients = GRADIENTS[settings.gradients](online, target, settings.double, settings.loss)
+        self._online, self._target, self._optimiser, self._config = online, target, optimiser, config
+        double = config.algorithm == "double_dqn"
+        self._gradients = GRADIENTS[config.gradients](online, target, double, config.loss)
 
     def __call__(
         self, columns: dict[str, Tensor], learning_rate: float, updates: int
@@ -83,22 +64,22 @@ class TorchUpdates:
         """See `Updates`."""
         for group in self._optimiser.param_groups:
             group["lr"] = learning_rate
-        device, size = self._online.values.device, self._settings.batch_size
+        device, size = self._online.values.device, self._config.batch_size
         columns = {name: column.to(device) for name, column in columns.items()}
-        sums, errors = torch.zeros(3, device=device), torch.empty(len(columns["action"]), device=device)
-        starts = range(0, len(errors), size)
-        for number, start in enumerate(starts, updates + 1):
-            part = slice(start, start + size)
-            *means, errors[part] = self._gradients(as_batch(columns, part))
+        sums, td_errors = torch.zeros(3, device=device), torch.empty(len(columns["action"]), device=device)
+        starts = range(0, len(td_errors), size)
+        for update, start in enumerate(starts, updates + 1):
+            rows = slice(start, start + size)
+            *means, td_errors[rows] = self._gradients(minibatch(columns, rows))
             sums += torch.stack(means)
-            self._online.clip_gradients(self._settings.max_gradient_norm)
+            self._online.clip_gradients(self._config.max_gradient_norm)
             self._optimiser.step()
-            self._update_target(number)
-        return UpdateStats(*(sums / len(starts)).tolist()), errors.cpu().numpy()
+            self._update_target(update)
+        return UpdateStats(*(sums / len(starts)).tolist()), td_errors.cpu().numpy()
 
-    def _update_target(self, number: int) -> None:
-        online, target, rate = self._online.values.data, self._target.values.data, self._settings.soft_target_rate
-        if rate is not None:
-            target.lerp_(online, rate)
-        elif number % self._settings.target_update_interval == 0:
+    def _update_target(self, update: int) -> None:
+        online, target, config = self._online.values.data, self._target.values.data, self._config
+        if config.target_update == "soft":
+            target.lerp_(online, config.target_update_rate)
+        elif update % config.target_update_interval == 0:
             target.copy_(online)

@@ -100,7 +100,7 @@ def service_rows(config: RunConfig) -> list[tuple[str, list[float]]]:
             now_s = time.perf_counter()
             if loop.updates > last[1]:
                 if last[1]:
-                    (writing if loop._saver._checkpointer.is_busy else quiet).append(1000 * (now_s - last[0]))
+                    (writing if loop._checkpoints._writer.is_busy else quiet).append(1000 * (now_s - last[0]))
                 last = (now_s, loop.updates)
             return told.written >= CHECKPOINTS
 

@@ -14,7 +14,7 @@ from actors.rollout.worker import RolloutWorker
 from actors.service.messages import TransitionBlock
 from learner.config import RunConfig
 from learner.ray_backend.cluster import connect, leave
-from learner.training.cluster import learner_settings, rollout_settings, shard_settings
+from learner.training.cluster import rollout_settings, shard_settings
 from learner.update.learner import Learner
 from tests.benchmarks.service import learner_work, worker_work
 from tests.benchmarks.service_model import Costs
@@ -72,7 +72,7 @@ def measured_costs(config: RunConfig) -> Costs:
     bare = {"worker": worker_work(config, 6), "learner": learner_work(config)}
     found = timed_rates({name: stopwatch(one, time.process_time) for name, one in bare.items()}, ROUNDS)
     shape, rows = env_shape(config.env), config.batch_size * config.updates_per_call
-    learner, worker = Learner(learner_settings(config, shape)), RolloutWorker(rollout_settings(config), 0, 0)
+    learner, worker = Learner(config, shape), RolloutWorker(rollout_settings(config), 0, 0)
     worker.set_weights(learner.weights(0.0))
     block = worker.collect(0.1)
     connect(2, None)

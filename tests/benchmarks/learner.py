@@ -10,10 +10,11 @@ from rich.console import Console
 from rich.table import Table
 
 from actors.policy.network import QNetwork
+from actors.rollout.vector_env import EnvShape
 from actors.service.messages import transition_dtype
-from learner.update.double_dqn import as_batch, mean_loss, targets
+from learner.config import RunConfig
+from learner.update.double_dqn import mean_loss, minibatch, td_targets
 from learner.update.learner import Columns, Learner
-from learner.update.updates import LearnerSettings
 from tests.benchmarks.timing import ratio, spread, stopwatch, timed_rates
 
 SHAPES = (((16, 64, 64, 8), 64), ((16, 64, 64, 8), 256), ((16, 128, 128, 8), 256), ((72, 128, 128, 9), 256))
@@ -23,9 +24,13 @@ ROUNDS = 5
 RATE = 1e-4
 
 
+def space_of(observation_size: int) -> Box:
+    return Box(-10, 10, (observation_size,), np.float32)
+
+
 def random_rows(size: int, observation_size: int, num_actions: int) -> np.ndarray:
     rng = np.random.default_rng(0)
-    rows = np.zeros(size, transition_dtype(Box(-10, 10, (observation_size,), np.float32)))
+    rows = np.zeros(size, transition_dtype(space_of(observation_size)))
     rows["observation"], rows["next_observation"] = rng.normal(size=(2, size, observation_size))
     rows["action"] = rng.integers(num_actions, size=size)
     rows["reward"], rows["discount"] = rng.normal(size=size), 0.99
@@ -33,22 +38,8 @@ def random_rows(size: int, observation_size: int, num_actions: int) -> np.ndarra
 
 
 def our_work(rows: np.ndarray, sizes: tuple[int, ...], batch: int):
-    settings = LearnerSettings(
-        observation_size=sizes[0],
-        num_actions=sizes[-1],
-        hidden_sizes=sizes[1:-1],
-        double=True,
-        batch_size=batch,
-        target_update_interval=500,
-        max_gradient_norm=10.0,
-        gradients="by_hand",
-        seed=0,
-        network="plain",
-        loss="huber",
-        soft_target_rate=None,
-        device="cpu",
-    )
-    learner = Learner(settings)
+    config = RunConfig(hidden_sizes=sizes[1:-1], batch_size=batch, device="cpu")
+    learner = Learner(config, EnvShape(space_of(sizes[0]), sizes[-1]))
 
     def work() -> int:
         learner.update(rows, RATE)
@@ -67,8 +58,10 @@ def plain_work(rows: np.ndarray, sizes: tuple[int, ...], batch: int):
     def work() -> int:
         columns = columns_of(rows)
         for start in range(0, len(rows), batch):
-            part = as_batch(columns, slice(start, start + batch))
-            loss, _ = mean_loss(online(part.s_tm1), part.a_tm1, targets(part, online, target, True))
+            part = minibatch(columns, slice(start, start + batch))
+            with torch.no_grad():
+                goal = td_targets(target(part.s_t), online(part.s_t), part.r_t, part.discount_t)
+            loss, _ = mean_loss(online(part.s_tm1), part.a_tm1, goal)
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             torch.nn.utils.clip_grad_norm_(online.parameters(), 10.0)

@@ -9,10 +9,10 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig
 from learner.loop import Observer, TrainingLoop
-from learner.placement import Place
-from learner.ray_backend.cluster import ray_cluster
+from learner.ray_backend.cluster import RayCluster
 from learner.tracking.journal import Journal
 from tests.benchmarks.processes import cpu_seconds
 from tests.checkpointing import Silent
@@ -28,7 +28,7 @@ WARM_S = 3.0
 @contextmanager
 def ray_service(config: RunConfig) -> Iterator[Callable[[Observer, Callable[[], bool]], TrainingLoop]]:
     """Starts the parts of a run; what it gives makes the loop from an observer and a question whether to stop."""
-    cluster = ray_cluster(config, 0, Place())
+    cluster = RayCluster(config, 0, ClusterOptions())
     try:
         with tempfile.TemporaryDirectory() as folder, closing(Journal(Path(folder) / "m.jsonl", 0)) as journal:
             checkpoints = Path(folder) / "checkpoints"

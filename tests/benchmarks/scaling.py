@@ -13,7 +13,6 @@ from actors.rollout.vector_env import env_shape
 from actors.service.messages import transition_dtype
 from actors.service.packing import estimate_frames, packed_dtype
 from learner.config import RunConfig
-from learner.training.cluster import learner_settings
 from learner.update.learner import Learner
 from tests.benchmarks.hop_costs import measured_costs
 from tests.benchmarks.ray_service import ENDLESS, Point, measured_point
@@ -137,7 +136,7 @@ def draw(points: dict[tuple[int, float], Point], costs: Costs, work: Work, cores
 
 def work_of(config: RunConfig) -> Work:
     shape = env_shape(config.env)
-    arrays = Learner(learner_settings(config, shape)).weights(0.0).arrays
+    arrays = Learner(config, shape).weights(0.0).arrays
     row = transition_dtype(shape.observation_space)
     frames = estimate_frames(config.block_env_steps, config.steps_per_block, config.n_step)
     packed = packed_dtype(row).itemsize + frames / config.block_env_steps * row["observation"].itemsize

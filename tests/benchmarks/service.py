@@ -12,7 +12,7 @@ from actors.rollout.vector_env import env_shape, make_vector_env
 from actors.rollout.worker import RolloutWorker
 from actors.service.messages import transition_dtype
 from learner.config import RunConfig
-from learner.training.cluster import learner_settings, rollout_settings
+from learner.training.cluster import rollout_settings
 from learner.update.learner import Learner
 from sim_core.config import WorldConfig
 from tests.benchmarks.ray_service import ENDLESS, Point, measured_point
@@ -60,7 +60,7 @@ def simulator_work(config: RunConfig, blocks: int):
 
 def worker_work(config: RunConfig, blocks: int):
     worker = RolloutWorker(rollout_settings(config), 0, 0)
-    learner = Learner(learner_settings(config, env_shape(config.env)))
+    learner = Learner(config, env_shape(config.env))
     worker.set_weights(snapshot(learner.online, 0, 0.0))
 
     def work() -> int:
@@ -71,7 +71,7 @@ def worker_work(config: RunConfig, blocks: int):
 
 def learner_work(config: RunConfig):
     shape = env_shape(config.env)
-    learner = Learner(learner_settings(config, shape))
+    learner = Learner(config, shape)
     rows = np.zeros(config.batch_size * config.updates_per_call, transition_dtype(shape.observation_space))
     rows["observation"] = np.random.default_rng(0).integers(-5, 5, rows["observation"].shape)
     columns = {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}  # as a shard draws them

@@ -10,7 +10,7 @@ import pytest
 from learner.checkpoints.checkpoint import newest_valid
 from learner.loop import TrainingLoop
 from learner.tracking.journal import Journal
-from learner.training.cluster import process_cluster
+from learner.training.cluster import ProcessCluster
 from tests.checkpointing import Silent
 from tests.integration.conftest import SMALL
 
@@ -24,7 +24,7 @@ def checkpoints(tmp_path_factory) -> Path:
     config = dataclasses.replace(SMALL, workers=2, replay_shards=2, replay="prioritised", total_env_steps=3_000)
     with closing(Journal(folder / "metrics.jsonl", 0)) as journal:
         assert TrainingLoop(
-            config, process_cluster(config, 0), journal, folder / "checkpoints", Silent(), lambda: False
+            config, ProcessCluster(config, 0), journal, folder / "checkpoints", Silent(), lambda: False
         ).run()
     return folder / "checkpoints"
 

@@ -29,7 +29,7 @@ from learner.sweep.cell import SweepPlace, run_cell
 from learner.sweep.grid import SweepConfig, make_cells
 from learner.tracking.journal import Journal, read_rows
 from learner.tracking.mlflow_run import Tracker
-from learner.training.cluster import process_cluster
+from learner.training.cluster import ProcessCluster
 from tests.dashboards.chromium import complaints, open_chromium, wait_until
 from tests.dashboards.pages.test_report_page import requested
 from tests.integration.conftest import SMALL, clean_environment
@@ -73,7 +73,7 @@ def train(folder, env_steps):
     run = RunFolder(folder)
     run.save_config(config)
     with closing(Journal(run.journal, 0)) as journal:
-        loop = TrainingLoop(config, process_cluster(config, 0), journal, run.checkpoints, Silent(), bool)
+        loop = TrainingLoop(config, ProcessCluster(config, 0), journal, run.checkpoints, Silent(), bool)
         assert loop.run()
     return run
 

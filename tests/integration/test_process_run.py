@@ -14,7 +14,7 @@ from safetensors.numpy import load_file
 from learner.checkpoints.checkpoint import newest_valid
 from learner.loop import TrainingLoop
 from learner.tracking.journal import Journal
-from learner.training.cluster import process_cluster
+from learner.training.cluster import ProcessCluster
 from tests.checkpointing import Silent
 from tests.integration.conftest import flags
 from tests.integration.jobs import Job
@@ -44,7 +44,7 @@ class Listing(Silent):
 def train(config, folder: Path, observer=None) -> None:
     """Trains to the end, from the newest checkpoint in the folder if there is one."""
     saved = newest_valid(folder / "checkpoints")[0] if (folder / "checkpoints").exists() else None
-    cluster = process_cluster(config, saved.state["incarnation"] + 1 if saved else 0)
+    cluster = ProcessCluster(config, saved.state["incarnation"] + 1 if saved else 0)
     with closing(Journal(folder / "metrics.jsonl", saved.state["journal_offset"] if saved else 0)) as journal:
         loop = TrainingLoop(config, cluster, journal, folder / "checkpoints", observer or Silent(), bool)
         if saved:

@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 import torch
 
+from actors.rollout.vector_env import EnvShape
 from actors.service.messages import transition_dtype
 from learner.config import RunConfig
-from learner.update.updates import LearnerSettings
 from sim_core.config import WorldConfig
 
-ROW = transition_dtype(gym.spaces.Box(-100, 100, (3,), np.float32))
+SHAPE = EnvShape(gym.spaces.Box(-100, 100, (3,), np.float32), 4)
+ROW = transition_dtype(SHAPE.observation_space)
 
 
 def _make_rows(count, seed=0, num_actions=4):
@@ -37,21 +38,20 @@ def make_rows():
 
 
 @pytest.fixture(scope="session")
-def learner_settings():
-    """Settings of a small learner for such rows."""
-    return LearnerSettings(
-        observation_size=3,
-        num_actions=4,
+def learner_shape():
+    """Spaces of an environment with such observations and four actions."""
+    return SHAPE
+
+
+@pytest.fixture(scope="session")
+def learner_config():
+    """A run whose learner is small."""
+    return RunConfig(
         hidden_sizes=(8, 6),
-        double=True,
         batch_size=16,
         target_update_interval=3,
         max_gradient_norm=0.25,
-        gradients="by_hand",
         seed=5,
-        network="plain",
-        loss="huber",
-        soft_target_rate=None,
         device="cpu",
     )
 

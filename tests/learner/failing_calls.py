@@ -1,4 +1,4 @@
-"""Calls within one process that behave like those between processes, with faults where the test wants them."""
+"""Calls within one process that behave like calls between processes, with faults that the test chooses."""
 
 import threading
 from collections import defaultdict, deque
@@ -10,7 +10,7 @@ from actors.service.rpc import Done, LocalCalls
 
 
 class Later:
-    """A call that runs when its turn on its node comes."""
+    """A call that runs when it reaches the head of its node's queue."""
 
     def __init__(self, node, method, args):
         self.call, self.result, self.error, self.ran = (node, method, args), None, None, False
@@ -36,7 +36,7 @@ class FailingCalls(LocalCalls):
         self._turn = threading.RLock()
 
     def start(self, node, method, *args):
-        later = Later(node, method, args)
+        later = Later(node, method.__name__, args)
         with self._turn:
             self._queues[id(node)].append(later)
         return later
@@ -44,8 +44,8 @@ class FailingCalls(LocalCalls):
     def run(self, function, *args):
         try:
             return Done(function(*map(self._value, args)))
-        except CallFailed as error:  # of a call whose result is an argument
-            later = Later(None, function, args)
+        except CallFailed as error:  # raised by a call whose result is an argument
+            later = Later(None, function.__name__, args)
             later.ran, later.error = True, error
             return later
 
@@ -53,7 +53,7 @@ class FailingCalls(LocalCalls):
         return self.get(arg) if isinstance(arg, Done | Later) else arg
 
     def wait(self, refs, timeout_s):
-        """Some of `refs`, at least one; none before an earlier one of its node."""
+        """Some of `refs`, at least one; none before an earlier one of the same node."""
         if len(refs) == 1:
             return list(refs)
         held_back, ready = set(), []

@@ -1,4 +1,4 @@
-"""The training loop ends where it was told to, however far ahead its rollout workers go."""
+"""The training loop ends where it should, however far its rollout workers run ahead."""
 
 import dataclasses
 from collections import Counter
@@ -9,7 +9,7 @@ import pytest
 from actors.rollout.node import RolloutNode
 from learner.loop import TrainingLoop
 from learner.tracking.journal import Journal
-from learner.training.cluster import process_cluster, rollout_settings
+from learner.training.cluster import ProcessCluster, rollout_settings
 from tests.checkpointing import Silent
 from tests.learner.failing_calls import FailingCalls
 
@@ -17,14 +17,15 @@ PUSHES = 2
 
 
 def run_ahead(config, calls=None):
-    """A cluster in this process whose parts may have two calls under way, as over Ray."""
-    cluster = process_cluster(config, 0)
-    calls = calls or cluster.calls
-    nodes = [RolloutNode(rollout_settings(config), i, 0, calls, cluster.targets, PUSHES) for i in range(config.workers)]
+    """A cluster in this process whose components may have two calls in flight, as over Ray."""
+    cluster = ProcessCluster(config, 0, calls)
+    cluster.workers = [
+        RolloutNode(rollout_settings(config), i, 0, cluster.calls, cluster.targets, PUSHES)
+        for i in range(config.workers)
+    ]
     blocks = config.workers * (2 + PUSHES)
-    return cluster._replace(
-        calls=calls, workers=nodes, collects_in_flight=2, updates_in_flight=2, blocks_in_flight=blocks
-    )
+    cluster.limits = cluster.limits._replace(collects_in_flight=2, updates_in_flight=2, blocks_in_flight=blocks)
+    return cluster
 
 
 @pytest.mark.parametrize("workers", [1, 3])
@@ -40,7 +41,7 @@ def test_no_round_of_blocks_is_ordered_past_the_end(small_run, tmp_path, workers
 
 
 @pytest.mark.parametrize("workers", [1, 3])
-def test_a_checkpoint_waits_for_one_call_of_each_part(small_run, tmp_path, monkeypatch, workers):
+def test_a_checkpoint_waits_for_one_call_of_each_component(small_run, tmp_path, monkeypatch, workers):
     block = small_run.block_env_steps
     config = dataclasses.replace(
         small_run, workers=workers, total_env_steps=60 * block, checkpoint_every_env_steps=10 * block, min_replay=block
@@ -49,18 +50,18 @@ def test_a_checkpoint_waits_for_one_call_of_each_part(small_run, tmp_path, monke
 
     def note():
         rounds.append(most())
-        if loop._saver._checkpointer._thread is not None:
-            loop._saver._checkpointer._thread.join()  # so that every checkpoint that is due is begun
+        if loop._checkpoints._writer._thread is not None:
+            loop._checkpoints._writer._thread.join()  # so that no due checkpoint is held up by the one before
 
     def most():
-        calls = Counter(pending.component for pending in loop._under_way._calls.values())
+        calls = Counter(call.component for call in loop._in_flight._calls.values())
         return max(calls.values(), default=0)
 
     with closing(Journal(tmp_path / "m.jsonl", 0)) as journal:
         cluster = run_ahead(config, FailingCalls(lambda node, method: None))
         loop = TrainingLoop(config, cluster, journal, tmp_path / "checkpoints", Silent(), note)
-        begin = loop.checkpoint
-        monkeypatch.setattr(loop, "checkpoint", lambda: (begun.append(most()), begin()))
+        begin = loop.begin_checkpoint
+        monkeypatch.setattr(loop, "begin_checkpoint", lambda: (begun.append(most()), begin()))
         assert loop.run()
-    assert max(rounds) == 2  # else there is nothing to hold back
+    assert max(rounds) == 2  # else nothing was held back
     assert len(begun) >= 5 and max(begun) == 1

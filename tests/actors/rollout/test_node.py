@@ -1,4 +1,4 @@
-"""Rollout nodes and shard nodes: pushes, replies, reports and state."""
+"""The nodes of rollout workers and shards: pushes, replies, reports and state."""
 
 import numpy as np
 import pytest
@@ -20,17 +20,17 @@ BLOCK = NUM_ENVS * STEPS
 
 
 class Later:
-    """A result that is there once it has been asked for."""
+    """A call that runs when its result is asked for."""
 
     def __init__(self, node, method, args):
         self.call, self.value, self.done = (node, method, args), None, False
 
 
 class DeferredCalls(LocalCalls):
-    """Calls that run when somebody asks for them, as if in another, busy process."""
+    """Calls that run when their results are asked for, as if in another, busy process."""
 
     def start(self, node, method, *args):
-        return Later(node, method, args)
+        return Later(node, method.__name__, args)
 
     def get(self, ref):
         if not ref.done:
@@ -71,7 +71,7 @@ def test_blocks_go_to_the_shards_in_turn(make_node, make_shard):
     assert sizes == [[0, 1, 0], [0, 1, 1], [1, 1, 1], [1, 2, 1]]
 
 
-def test_all_of_a_workers_time_counts_for_what_it_does(make_node, make_shard, monkeypatch):
+def test_all_of_a_workers_time_is_attributed(make_node, make_shard, monkeypatch):
     now = [100.0]
     monkeypatch.setattr(rollout_node, "Stopwatch", lambda: Stopwatch(lambda: now[0]))
 
@@ -100,7 +100,7 @@ def test_all_of_a_workers_time_counts_for_what_it_does(make_node, make_shard, mo
     assert report.seconds == {"acts": 2.0, "waits": 96.0, "stores": 8.0}
 
 
-def test_what_is_stored_is_what_the_worker_collected(make_node, make_shard, settings, swarm, make_weights):
+def test_the_shard_stores_what_the_worker_collected(make_node, make_shard, settings, swarm, make_weights):
     shard, twin = make_shard(), RolloutWorker(settings, 0, 0)
     twin.set_weights(make_weights(swarm, version=10, time_s=100.0))
     report = make_node([shard]).collect(0.5)[0]
@@ -110,7 +110,7 @@ def test_what_is_stored_is_what_the_worker_collected(make_node, make_shard, sett
     assert {row.tobytes() for row in drawn} == {row.tobytes() for row in unpack(block.packed, drawn.dtype)}
 
 
-def test_newer_weights_come_with_the_reply(make_node, make_shard, swarm, make_weights):
+def test_newer_weights_arrive_with_the_reply(make_node, make_shard, swarm, make_weights):
     shard = make_shard()
     node = make_node([shard])
     shard.publish(make_weights(swarm, seed=1, version=13, time_s=200.0))
@@ -141,7 +141,7 @@ def test_a_late_reply_does_not_bring_older_weights_back(make_node, make_shard, s
     assert node.settle()[0].header.policy_version == 15
 
 
-def test_staleness_in_seconds_counts_from_publication(monkeypatch, make_node, make_shard):
+def test_staleness_in_seconds_is_measured_from_publication(monkeypatch, make_node, make_shard):
     monkeypatch.setattr("actors.rollout.node.time.time", lambda: 142.5)
     assert make_node([make_shard()]).collect(0.0)[0].staleness_s == pytest.approx(42.5)
 
@@ -169,13 +169,13 @@ def test_a_duplicate_is_reported_as_nothing_stored(make_node, make_shard):
     assert shard.size() == BLOCK
 
 
-def test_a_failed_push_comes_out(make_node, make_shard, cart_pole):
+def test_an_error_of_a_push_is_raised(make_node, make_shard, cart_pole):
     other = ShardNode(ShardSettings(transition_dtype(env_shape(cart_pole).observation_space), 1000, 0))
     with pytest.raises(ValueError, match="schema"):
         make_node([other]).collect(0.5)
 
 
-def test_a_saved_node_goes_on_where_it_was(tmp_path, make_node, make_shard):
+def test_a_restored_node_goes_on_where_it_was(tmp_path, make_node, make_shard):
     shards = [make_shard(), make_shard()]
     node = make_node(shards)
     node.collect(0.5)
@@ -186,13 +186,14 @@ def test_a_saved_node_goes_on_where_it_was(tmp_path, make_node, make_shard):
     resumed.load(tmp_path / "worker.safetensors", state)
     for report in expected:
         other = resumed.collect(0.5)[0]
-        assert other.header == report.header._replace(made=report.header.made - BLOCK)  # counted from the start
+        made = report.header.made - BLOCK  # counted from the start of the incarnation
+        assert other.header == report.header._replace(made=made)
         for first, second in zip(other.episodes, report.episodes, strict=True):
             np.testing.assert_array_equal(first, second)
     assert [shard.size() // BLOCK for shard in again] == [1, 1]
 
 
-def test_nothing_is_saved_while_pushes_are_under_way(tmp_path, make_node, make_shard):
+def test_nothing_is_saved_while_pushes_are_in_flight(tmp_path, make_node, make_shard):
     node = make_node([make_shard()], DeferredCalls(), pushes_in_flight=1)
     node.collect(0.5)
     with pytest.raises(RuntimeError, match="settle"):
@@ -211,13 +212,13 @@ def test_damaged_files_are_refused(tmp_path, make_node, make_shard):
 
 
 class Unreliable(LocalCalls):
-    """Calls of which the first ones fail as told: (fault, whether the call was made all the same)."""
+    """Calls of which the first ones fail as given: (fault, whether the call was made nevertheless)."""
 
     def __init__(self, *faults):
         self.faults = list(faults)
 
     def start(self, node, method, *args):
-        fault, made = self.faults.pop(0) if method == "add" and self.faults else (None, True)
+        fault, made = self.faults.pop(0) if method.__name__ == "add" and self.faults else (None, True)
         result = super().start(node, method, *args) if made else None
         return (fault, result)
 
@@ -230,7 +231,7 @@ class Unreliable(LocalCalls):
 
 @pytest.mark.parametrize("made", [True, False])
 @pytest.mark.parametrize("times", [1, 2])
-def test_a_push_that_is_tried_again_is_stored_and_reported_once(make_node, make_shard, made, times):
+def test_a_retried_push_is_stored_and_reported_once(make_node, make_shard, made, times):
     shard = make_shard()
     node = make_node([shard], Unreliable(*[(Fault.UNREACHABLE, made)] * times))
     (report,) = node.collect(0.5)
@@ -239,7 +240,7 @@ def test_a_push_that_is_tried_again_is_stored_and_reported_once(make_node, make_
 
 
 @pytest.mark.parametrize("fault", [Fault.DIED, Fault.LATE])
-def test_a_block_whose_shard_is_gone_is_dropped_and_names_it(make_node, make_shard, fault):
+def test_a_block_whose_shard_is_gone_is_dropped_and_its_report_names_the_shard(make_node, make_shard, fault):
     shards = [make_shard(), make_shard()]
     node = make_node(shards, Unreliable((fault, False)))
     (report,) = node.collect(0.5)
@@ -251,7 +252,7 @@ def test_a_block_whose_shard_is_gone_is_dropped_and_names_it(make_node, make_sha
     assert [report.header.made for report in reports] == [2 * BLOCK, 3 * BLOCK]
 
 
-def test_a_shard_that_stays_out_of_reach_is_given_up(make_node, make_shard):
+def test_a_shard_that_stays_unreachable_is_given_up(make_node, make_shard):
     node = make_node([make_shard()], Unreliable(*[(Fault.UNREACHABLE, False)] * 9))
     (report,) = node.collect(0.5)
     assert (report.dropped, report.fault) == (Dropped.SHARD_LOST, Fault.UNREACHABLE)
@@ -266,7 +267,7 @@ def test_a_block_that_a_later_one_overtook_is_dropped_as_outdated(make_node, mak
     assert shard.add(first).outdated and shard.size() == BLOCK
 
 
-def test_a_fenced_worker_is_refused_and_its_deliveries_are_told(make_shard, settings, swarm, make_weights):
+def test_a_fenced_worker_is_refused_and_its_deliveries_are_returned(make_shard, settings, swarm, make_weights):
     shard, workers = make_shard(), [RolloutWorker(settings, 0, incarnation) for incarnation in (0, 3)]
     for worker in workers:
         worker.set_weights(make_weights(swarm))
@@ -274,7 +275,7 @@ def test_a_fenced_worker_is_refused_and_its_deliveries_are_told(make_shard, sett
     for block in blocks[:2]:
         shard.add(block)
     episodes = sum(len(block.episodes.outcome) for block in blocks[:2])
-    for _ in range(2):  # to ask twice changes nothing
+    for _ in range(2):  # fencing twice changes nothing
         assert shard.fence(0, 0, 3) == (2 * BLOCK, 2 * BLOCK, episodes, 2 * BLOCK)
     assert shard.add(blocks[2]).outdated and shard.size() == 2 * BLOCK
     assert shard.fence(0, 3, 4) == Delivered()
@@ -282,6 +283,6 @@ def test_a_fenced_worker_is_refused_and_its_deliveries_are_told(make_shard, sett
     assert shard.fence(1, 0, 1) == Delivered(), "another worker"
 
 
-def test_a_worker_whose_weights_were_lost_on_their_way_says_so(settings, make_shard):
+def test_a_worker_without_weights_fails(settings, make_shard):
     with pytest.raises(CallFailed, match="no weights"):
         RolloutNode(settings, 0, 0, LocalCalls(), [make_shard()], 0).collect(0.5)

@@ -114,3 +114,9 @@ def test_failures_name_the_component_and_can_be_pickled():
         assert type(again) is type(error) and vars(again) == vars(error)
     assert str(ComponentFailed(WORKER, 3, Fault.LATE, "silent")) == "rollout worker 1 late (silent)"
     assert [str(component) for component in (SHARD, LEARNER, EVALUATOR)] == ["replay shard 0", "learner", "evaluation"]
+
+
+def test_a_failed_call_is_a_failure_of_the_component_that_was_called():
+    failure = CallFailed(Fault.OBJECT_LOST, "gone").of(WORKER, 7)
+    assert vars(failure) == {"component": WORKER, "incarnation": 7, "fault": Fault.OBJECT_LOST, "reason": "gone"}
+    assert CallFailed(Fault.OBJECT_LOST, "gone").of(WORKER, 7, "save").reason == "save: gone"

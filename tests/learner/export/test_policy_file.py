@@ -10,7 +10,7 @@ from learner.checkpoints.checkpoint import Checkpoint
 from learner.checkpoints.manifest import CheckpointError
 from learner.config import RunConfig
 from learner.export.policy_file import read_policy, read_saved_policy, save_policy
-from learner.training.cluster import process_cluster
+from learner.training.cluster import ProcessCluster
 from sim_core.config import WorldConfig
 from tests import checkpointing
 
@@ -23,13 +23,13 @@ def checkpoint_of(learner, folder):
 @pytest.fixture
 def saved(tmp_path, small_run):
     """A checkpoint of a learner, and the weights that it published."""
-    learner = process_cluster(small_run, 0).learner
+    learner = ProcessCluster(small_run, 0).learner
     return checkpoint_of(learner, tmp_path), learner.weights()
 
 
 def test_a_dueling_policy_is_kept_as_the_plain_network_that_it_equals(tmp_path, small_run):
     config = dataclasses.replace(small_run, network="dueling", hidden_sizes=(9, 8))
-    shape, learner = env_shape(config.env), process_cluster(config, 0).learner
+    shape, learner = env_shape(config.env), ProcessCluster(config, 0).learner
     weights = learner.weights()
     save_policy(tmp_path / "policy.safetensors", weights, config, shape)
     again = read_saved_policy(tmp_path / "policy.safetensors", config, shape)

@@ -1,4 +1,4 @@
-"""Who may speak to the Ray that a process starts or joins."""
+"""Access to the Ray that a process starts or joins."""
 
 import os
 import sys
@@ -23,18 +23,18 @@ def mode(joins: bool) -> str:
     return os.environ["RAY_AUTH_MODE"]
 
 
-def test_without_a_token_none_is_shown():
+def test_a_cluster_is_joined_without_a_token_if_the_user_has_none():
     assert mode(joins=True) == "disabled"
 
 
-def test_a_ray_of_our_own_keeps_to_loopback_and_asks_for_a_token_of_its_own():
+def test_a_local_ray_listens_on_loopback_and_requires_its_own_token():
     assert mode(joins=False) == "token" and os.environ[REMOTE] == "0"
     token = os.environ["RAY_AUTH_TOKEN"]
     assert len(token) == 64
     assert mode(joins=False) == "token" and os.environ["RAY_AUTH_TOKEN"] == token, "made once"
 
 
-def test_a_ray_of_our_own_asks_for_the_users_token(monkeypatch):
+def test_a_local_ray_requires_the_token_of_the_user(monkeypatch):
     monkeypatch.setenv("RAY_AUTH_TOKEN", "a")
     assert mode(joins=False) == "token" and os.environ["RAY_AUTH_TOKEN"] == "a"
 
@@ -57,13 +57,13 @@ def test_a_token_is_found_where_ray_looks(where, monkeypatch, tmp_path):
     assert mode(joins=True) == "token"
 
 
-def test_what_the_user_has_set_stays(monkeypatch):
+def test_variables_of_the_user_are_kept(monkeypatch):
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("RAY_AUTH_TOKEN", "a")
     assert mode(joins=True) == "disabled"
 
 
-def test_a_ray_that_was_imported_unguarded_is_not_started(monkeypatch):
+def test_ray_is_not_started_if_it_was_imported_unguarded(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", object())
     with pytest.raises(ConfigError, match=r"guard_ray first, or set RAY_AUTH_MODE and RAY_AUTH_TOKEN"):
         guard_ray(joins=False)

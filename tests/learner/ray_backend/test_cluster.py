@@ -1,10 +1,10 @@
-"""What Ray's errors mean, without a cluster."""
+"""The faults that Ray's errors stand for, without a cluster."""
 
 import pytest
 from ray import exceptions as ray_errors
 
 from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, Fault
-from learner.ray_backend import cluster as ray_edge
+from learner.ray_backend import cluster as ray_cluster
 from learner.ray_backend.cluster import RayCalls
 
 DIED = ray_errors.ActorDiedError()
@@ -31,7 +31,7 @@ def get(monkeypatch):
         def failing_get(ref, timeout):
             raise error
 
-        monkeypatch.setattr(ray_edge.ray, "get", failing_get)
+        monkeypatch.setattr(ray_cluster.ray, "get", failing_get)
         with pytest.raises(Exception) as caught:  # noqa: PT011 - the test looks at it
             RayCalls(5.0).get("ref")
         return caught.value
@@ -40,7 +40,7 @@ def get(monkeypatch):
 
 
 @pytest.mark.parametrize(("error", "fault"), ERRORS, ids=lambda value: type(value).__name__)
-def test_a_failure_of_the_system_is_a_fault(get, error, fault):
+def test_an_error_of_ray_is_a_fault(get, error, fault):
     raised = get(error)
     assert type(raised) is CallFailed and raised.fault is fault
     assert raised.reason and "\n" not in raised.reason
@@ -53,7 +53,7 @@ def test_a_failure_of_the_system_is_a_fault(get, error, fault):
         CallFailed(Fault.OBJECT_LOST, "no weights"),
     ],
 )
-def test_a_fault_that_a_part_met_comes_out_as_it_is(get, cause):
+def test_a_fault_that_a_node_raised_is_unchanged(get, cause):
     raised = get(ray_errors.RayTaskError("update", "trace", cause).as_instanceof_cause())
     assert type(raised) is type(cause) and vars(raised) == vars(cause)
 
@@ -62,7 +62,7 @@ def test_an_argument_that_was_lost_is_a_fault(get):
     assert get(ray_errors.RayTaskError("evaluate", "trace", OWNER).as_instanceof_cause()).fault is Fault.OBJECT_LOST
 
 
-def test_an_error_of_our_own_code_stays_one(get):
+def test_an_error_of_our_own_code_is_unchanged(get):
     raised = get(ray_errors.RayTaskError("load", "trace", ValueError("another shape")).as_instanceof_cause())
     assert isinstance(raised, ValueError) and not isinstance(raised, CallFailed)
 

@@ -1,4 +1,4 @@
-"""What Ray's metrics are told of a run's rows; a real Prometheus reads them in tests/integration."""
+"""Rows of a run as Ray metrics; in tests/integration a real Prometheus reads them."""
 
 import math
 
@@ -11,7 +11,7 @@ from learner.tracking.metric_names import METRICS
 
 
 class Told:
-    """Stands in for Ray's Gauge and Counter; keeps the order of what it is told under the metric's name."""
+    """Stands in for Ray's Gauge and Counter; records what is set or added under the metric's name."""
 
     calls: list[tuple[str, float, dict[str, str]]] = []
 
@@ -29,7 +29,7 @@ class Told:
 
 @pytest.fixture
 def told(monkeypatch):
-    """Function: what was told since the last call, as {name: value}."""
+    """Function: what was set or added since the last call, as {name: value}."""
     monkeypatch.setattr(ray_metrics, "Gauge", Told)
     monkeypatch.setattr(ray_metrics, "Counter", Told)
     monkeypatch.setattr(Told, "calls", [])
@@ -52,7 +52,7 @@ def test_gauges_show_the_newest_values_and_counters_what_was_added(told):
     assert told() == {"shoal_epsilon": 0.4, "shoal_env_steps": 50, "shoal_updates": 4, "shoal_episodes": 3}
 
 
-def test_what_a_row_did_not_measure_is_shown_again_because_ray_forgets(told):
+def test_values_of_earlier_rows_are_exported_again_because_ray_drops_them(told):
     metrics = RayMetrics("r")
     metrics.row(Row(100, 0, {"eval/success_rate": 0.25}))
     told()
@@ -60,7 +60,7 @@ def test_what_a_row_did_not_measure_is_shown_again_because_ray_forgets(told):
     assert told() == {"shoal_eval_success_rate": 0.25, "shoal_loss": 1.5, "shoal_env_steps": 100}
 
 
-def test_the_row_of_an_earlier_evaluation_takes_nothing_back(told):
+def test_the_row_of_an_earlier_evaluation_decreases_no_counter(told):
     metrics = RayMetrics("r")
     metrics.row(Row(300, 0, {"account/updates": 8}))
     metrics.row(Row(200, 0, {"eval/return": 1.0}))
@@ -69,12 +69,12 @@ def test_the_row_of_an_earlier_evaluation_takes_nothing_back(told):
     assert added == [("shoal_env_steps", 300), ("shoal_env_steps", 50)]
 
 
-def test_nothing_is_shown_that_is_no_number(told):
+def test_values_that_are_not_finite_are_not_exported(told):
     RayMetrics("r").row(Row(1, 0, {"replay/samples_per_insert": math.nan, "train/loss": math.inf}))
     assert told() == {"shoal_env_steps": 1}
 
 
-def test_every_metric_of_the_table_is_shown(told):
+def test_every_metric_of_the_table_is_exported(told):
     metrics = {known.journal: 1.0 for known in METRICS}
     RayMetrics("r").row(Row(1, 0, metrics))
     assert set(told()) == {known.name for known in METRICS}

@@ -10,7 +10,7 @@ def test_events_come_back_in_order(tmp_path):
     path = tmp_path / "run" / "faults.jsonl"
     log = FaultLog(path)
     log.failed(ComponentFailed(WORKER, 0, Fault.LATE, "silent"), Decision(Action.RESTART, 2))
-    log.mended(Recovered(WORKER, Fault.LATE, Action.RESTART, 2, 1.5))
+    log.recovered(Recovered(WORKER, Fault.LATE, Action.RESTART, 2, 1.5))
     log.resumed()
     entries = read_faults(path)
     assert [entry[1:] for entry in entries] == [

@@ -11,7 +11,7 @@ from learner.config import RunConfig
 from learner.loop import TrainingLoop
 from learner.tracking.journal import Journal, charted
 from learner.tracking.metric_names import ENV_STEPS, METRICS
-from learner.training.cluster import process_cluster
+from learner.training.cluster import ProcessCluster
 from tests.checkpointing import Silent
 
 README = Path(__file__).parents[3] / "learner" / "README.md"
@@ -20,7 +20,7 @@ README = Path(__file__).parents[3] / "learner" / "README.md"
 def journal_names(config: RunConfig, folder: Path) -> set[str]:
     """Names of all metrics that a run in one process leaves in its journal."""
     with closing(Journal(folder / "metrics.jsonl", 0)) as journal:
-        loop = TrainingLoop(config, process_cluster(config, 0), journal, folder / "checkpoints", Silent(), bool)
+        loop = TrainingLoop(config, ProcessCluster(config, 0), journal, folder / "checkpoints", Silent(), bool)
         assert loop.run()
         return {name for row in journal.rows() for name in row.metrics}
 

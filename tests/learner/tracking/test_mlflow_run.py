@@ -14,7 +14,6 @@ from actors.rollout.vector_env import env_shape
 from learner.config import RunConfig, config_hash, flat_params
 from learner.tracking.journal import Row
 from learner.tracking.mlflow_run import Tracker, check_reachable, git_commit
-from learner.training.cluster import learner_settings as settings_of
 from learner.update.learner import Learner
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
@@ -147,7 +146,7 @@ def test_files_and_folders_become_artifacts(tracker, tmp_path):
 @pytest.fixture
 def policy(small_run):
     shape = env_shape(small_run.env)
-    return Learner(settings_of(small_run, shape)).weights(0.0), shape
+    return Learner(small_run, shape).weights(0.0), shape
 
 
 def test_the_logged_policy_gives_the_same_values(tracker, policy, small_run):

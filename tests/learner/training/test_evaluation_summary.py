@@ -1,4 +1,4 @@
-"""Summaries of ended episodes and their metrics."""
+"""Summaries of finished episodes, and their metrics."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The accounts balance when nothing is lost, when something is, and not when a hop cheats."""
+"""The accounts balance with and without losses, and do not when a hop loses or doubles a block unnoticed."""
 
 import json
 
@@ -21,102 +21,111 @@ def ledger():
     return Ledger(2, [1_000, 1_000])
 
 
+def balances(ledger):
+    """Whether every transition that was produced is stored or dropped."""
+    return ledger.produced == ledger.stored + sum(ledger.dropped.values())
+
+
 def totals(ledger):
     return ledger.produced, ledger.stored, sum(ledger.dropped.values()), ledger.episodes
 
 
 def test_stored_blocks_balance(ledger):
-    assert [ledger.take(report(90, 90)), ledger.take(report(100, 190, shard=1)), ledger.take(report(80, 80, 1))] == [
+    assert [
+        ledger.record_block(report(90, 90)),
+        ledger.record_block(report(100, 190, shard=1)),
+        ledger.record_block(report(80, 80, 1)),
+    ] == [
         90,
         100,
         80,
     ]
-    assert totals(ledger) == (270, 270, 0, 6) and ledger.balances
+    assert totals(ledger) == (270, 270, 0, 6) and balances(ledger)
     assert ledger.replay_size == 270
 
 
 @pytest.mark.parametrize("reason", Dropped)
 def test_dropped_blocks_balance_under_their_reason(ledger, reason):
-    assert ledger.take(report(90, 90, dropped=reason)) == 0
-    assert totals(ledger) == (90, 0, 90, 2) and ledger.balances
+    assert ledger.record_block(report(90, 90, dropped=reason)) == 0
+    assert totals(ledger) == (90, 0, 90, 2) and balances(ledger)
     assert ledger.dropped[reason] == 90 and ledger.replay_size == 0
 
 
-def test_a_block_that_nobody_reports_is_missed(ledger):
-    ledger.take(report(90, 90))
-    ledger.take(report(100, 290))  # 100 more were made in between
-    assert not ledger.balances
+def test_an_unreported_block_unbalances_the_accounts(ledger):
+    ledger.record_block(report(90, 90))
+    ledger.record_block(report(100, 290))  # 100 more were produced in between
+    assert not balances(ledger)
     assert totals(ledger) == (290, 190, 0, 4)
 
 
-def test_a_block_that_is_reported_twice_is_noticed(ledger):
+def test_a_block_that_is_reported_twice_unbalances_the_accounts(ledger):
     for _ in range(2):
-        ledger.take(report(90, 90))
-    assert not ledger.balances
+        ledger.record_block(report(90, 90))
+    assert not balances(ledger)
 
 
 def test_a_full_shard_holds_its_capacity(ledger):
     for i in range(1, 4):
-        ledger.take(report(600, 600 * i))
+        ledger.record_block(report(600, 600 * i))
     assert ledger.replay_size == 1_000 and ledger.stored == 1_800
 
 
-def test_a_lost_worker_leaves_what_it_had_delivered(ledger):
-    ledger.take(report(90, 90))
-    ledger.take(report(100, 190, shard=1))
+def test_what_a_lost_worker_delivered_counts_as_stored(ledger):
+    ledger.record_block(report(90, 90))
+    ledger.record_block(report(100, 190, shard=1))
     # Shard 0 has stored one more block of 100 that nobody reported; the one before, of 50, never arrived.
-    unreported = ledger.worker_lost(0, [Delivered(190, 200, 5, 340), Delivered(100, 100, 2, 190)])
+    unreported = ledger.write_off_worker(0, [Delivered(190, 200, 5, 340), Delivered(100, 100, 2, 190)])
     assert unreported == Delivered(100, 100, 3, 0)
-    assert totals(ledger) == (340, 290, 50, 7) and ledger.balances
+    assert totals(ledger) == (340, 290, 50, 7) and balances(ledger)
     assert ledger.dropped[Dropped.WORKER_LOST] == 50
     assert ledger.replay_size == 290
-    ledger.take(report(80, 80))  # its successor counts from nothing
-    assert totals(ledger) == (420, 370, 50, 9) and ledger.balances
+    ledger.record_block(report(80, 80))  # its replacement counts from 0
+    assert totals(ledger) == (420, 370, 50, 9) and balances(ledger)
 
 
-def test_a_worker_that_had_reported_all_leaves_nothing_open(ledger):
-    ledger.take(report(90, 90))
-    assert ledger.worker_lost(0, [Delivered(90, 100, 2, 90), Delivered()]) == Delivered()
+def test_a_lost_worker_that_had_reported_everything_changes_nothing(ledger):
+    ledger.record_block(report(90, 90))
+    assert ledger.write_off_worker(0, [Delivered(90, 100, 2, 90), Delivered()]) == Delivered()
     assert totals(ledger) == (90, 90, 0, 2)
 
 
-def test_a_lost_shard_is_empty_and_names_its_share(ledger):
-    ledger.take(report(300, 300))
-    ledger.take(report(100, 400, shard=1))
-    assert ledger.shard_lost(0, 4) == 0.75
+def test_a_lost_shard_is_empty_and_its_share_is_returned(ledger):
+    ledger.record_block(report(300, 300))
+    ledger.record_block(report(100, 400, shard=1))
+    assert ledger.write_off_shard(0, 4) == 0.75
     assert ledger.replay_size == 100
-    assert ledger.shard_lost(1, 5) == 1.0
-    assert ledger.shard_lost(1, 6) == 0.0
-    assert ledger.replay_size == 0 and ledger.balances
+    assert ledger.write_off_shard(1, 5) == 1.0
+    assert ledger.write_off_shard(1, 6) == 0.0
+    assert ledger.replay_size == 0 and balances(ledger)
 
 
-def test_what_a_lost_shard_had_taken_counts_as_dropped(ledger):
-    ledger.shard_lost(0, 4)
-    assert ledger.take(report(90, 90)) == 0
-    assert ledger.take(report(100, 190, shard_incarnation=4)) == 100
-    assert ledger.dropped[Dropped.SHARD_LOST] == 90 and ledger.balances and ledger.replay_size == 100
+def test_a_block_that_was_pushed_to_a_lost_shard_counts_as_dropped(ledger):
+    ledger.write_off_shard(0, 4)
+    assert ledger.record_block(report(90, 90)) == 0
+    assert ledger.record_block(report(100, 190, shard_incarnation=4)) == 100
+    assert ledger.dropped[Dropped.SHARD_LOST] == 90 and balances(ledger) and ledger.replay_size == 100
 
 
-def test_a_worker_lost_after_a_shard_is_not_owed_what_the_shard_had(ledger):
-    ledger.take(report(90, 90))
-    ledger.shard_lost(0, 4)
-    ledger.take(report(50, 140, shard_incarnation=4))
-    unreported = ledger.worker_lost(0, [Delivered(60, 100, 2, 150), Delivered()])
+def test_a_worker_lost_after_a_shard_is_settled_with_the_new_shard_only(ledger):
+    ledger.record_block(report(90, 90))
+    ledger.write_off_shard(0, 4)
+    ledger.record_block(report(50, 140, shard_incarnation=4))
+    unreported = ledger.write_off_worker(0, [Delivered(60, 100, 2, 150), Delivered()])
     assert unreported.rows == 10 and totals(ledger)[:3] == (150, 150, 0)
 
 
 def test_the_row_has_the_accounts(ledger):
-    ledger.take(report(90, 90))
-    ledger.take(report(10, 100, dropped=Dropped.OUTDATED))
+    ledger.record_block(report(90, 90))
+    ledger.record_block(report(10, 100, dropped=Dropped.OUTDATED))
     expected = {"produced": 100.0, "stored": 90.0, "dropped": 10.0, "episodes": 4.0}
     assert ledger.row() == {f"account/{name}": value for name, value in expected.items()}
 
 
-def test_a_saved_state_goes_on(ledger):
-    ledger.take(report(90, 90))
-    ledger.take(report(10, 100, dropped=Dropped.SHARD_LOST))
+def test_a_restored_state_goes_on(ledger):
+    ledger.record_block(report(90, 90))
+    ledger.record_block(report(10, 100, dropped=Dropped.SHARD_LOST))
     resumed = Ledger(2, [1_000, 1_000])
     resumed.set_state(json.loads(json.dumps(ledger.get_state())))
     assert resumed.get_state() == ledger.get_state() and resumed.replay_size == 90
-    resumed.take(report(70, 70))  # of the next incarnation, which counts from nothing
-    assert totals(resumed) == (170, 160, 10, 6) and resumed.balances
+    resumed.record_block(report(70, 70))  # of the next incarnation, which counts from 0
+    assert totals(resumed) == (170, 160, 10, 6) and balances(resumed)

@@ -1,4 +1,4 @@
-"""What no machine can hold is refused at the start; what a run takes is estimated from what it makes."""
+"""Runs that no machine can hold are refused at the start; estimates match what a run allocates."""
 
 import dataclasses
 
@@ -8,8 +8,8 @@ import pytest
 
 from actors.rollout.vector_env import env_shape
 from learner.config import RunConfig
-from learner.training.cluster import process_cluster
-from learner.training.memory_estimate import check_fits, parts_bytes
+from learner.training.cluster import ProcessCluster
+from learner.training.memory_estimate import bytes_by_setting, check_fits
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 
@@ -38,14 +38,14 @@ def test_the_defaults_fit():
         ),
     ],
 )
-def test_what_no_machine_holds_is_refused_by_its_setting(changes, part):
+def test_a_run_that_no_machine_can_hold_is_refused_with_the_setting_to_blame(changes, part):
     with pytest.raises(ConfigError, match=f"of it by {part}, and this machine has"):
         check_fits(dataclasses.replace(RunConfig(), **changes))
 
 
 def bytes_of_a_full_shard(config):
-    """Bytes of a shard's rings once that of the rows is full."""
-    cluster = process_cluster(config, 0)
+    """Bytes of a shard's rings once the ring of rows is full."""
+    cluster = ProcessCluster(config, 0)
     worker, shard = cluster.workers[0], cluster.learner._shards[0].shard
     worker.set_weights(cluster.learner.weights())
     while shard.size < config.replay_capacity:
@@ -53,17 +53,17 @@ def bytes_of_a_full_shard(config):
     return shard._rows.nbytes + shard._frames.slots.nbytes
 
 
-def test_the_estimates_are_those_of_what_is_made(small_run):
+def test_estimates_match_what_is_allocated(small_run):
     shape = env_shape(small_run.env)
-    parts = parts_bytes(small_run, shape)
-    learner = process_cluster(small_run, 0).learner
+    parts = bytes_by_setting(small_run, shape)
+    learner = ProcessCluster(small_run, 0).learner
     larger = dataclasses.replace(small_run, replay_capacity=6_000)
     full = bytes_of_a_full_shard(larger)
-    assert full <= parts_bytes(larger, shape)["replay_capacity"] < 1.3 * full
+    assert full <= bytes_by_setting(larger, shape)["replay_capacity"] < 1.3 * full
     online = sum(tensor.numel() for tensor in learner._learner.online.state_dict().values())
     assert parts["hidden_sizes"] == online * 4 * 5
     prioritised = dataclasses.replace(small_run, replay="prioritised", network="dueling")
-    more, (shard, *_) = parts_bytes(prioritised, shape), process_cluster(prioritised, 0).learner._shards
+    more, (shard, *_) = bytes_by_setting(prioritised, shape), ProcessCluster(prioritised, 0).learner._shards
     tree = prioritised.replay_shards * shard.shard._tree._tree.nbytes
     assert tree <= more["replay_capacity"] - parts["replay_capacity"] < 2.1 * tree
     assert more["hidden_sizes"] > parts["hidden_sizes"]

@@ -1,4 +1,4 @@
-"""Pacing under every order of events: it never deadlocks, never leaves its band, and reaches its ratio."""
+"""Pacing under any order of events: it never deadlocks, never leaves its band, and converges to its ratio."""
 
 import math
 import random
@@ -41,37 +41,37 @@ def band(setup):
     return start - call, start + 2 * call + setup.blocks_in_flight * setup.block_rows * setup.samples_per_insert
 
 
-def start_all(pacer, setup, under_way, calls):
+def start_all(pacer, setup, in_flight, calls):
     """Starts whatever the pacer allows, as the training loop does."""
-    while under_way.count("block") < setup.blocks_in_flight and pacer.may_collect(under_way.count("block")):
-        under_way.append("block")
-    while under_way.count("update") < calls and (updates := pacer.updates_due()):
+    while in_flight.count("block") < setup.blocks_in_flight and pacer.may_collect(in_flight.count("block")):
+        in_flight.append("block")
+    while in_flight.count("update") < calls and (updates := pacer.updates_due()):
         assert updates == setup.updates_per_call
         assert pacer.state.inserted >= setup.min_replay
-        pacer.sampling(updates)
-        under_way.append("update")
+        pacer.record_sample(updates)
+        in_flight.append("update")
 
 
 def simulate(setup, calls, seed, events, short=True, loss=0.0):
-    """Ends one random call under way at a time; the pacer after `events` of them.
+    """Ends one random call in flight at a time; returns the pacer after `events` of them.
 
     With probability `loss` an event also loses a random share of the replay, and updates then fail.
     """
-    pacer, rng, under_way = Pacer(*setup), random.Random(seed), []
+    pacer, rng, in_flight = Pacer(*setup), random.Random(seed), []
     lowest, highest = band(setup)
     for _ in range(events):
-        start_all(pacer, setup, under_way, calls)
-        assert under_way, "deadlock"
-        kind = under_way.pop(rng.randrange(len(under_way)))
+        start_all(pacer, setup, in_flight, calls)
+        assert in_flight, "deadlock"
+        kind = in_flight.pop(rng.randrange(len(in_flight)))
         if kind == "block":  # the first blocks hold fewer rows (n-step), a duplicate none
-            pacer.inserted(rng.choice([setup.block_rows, setup.block_rows - 1, 0]) if short else setup.block_rows)
+            pacer.record_insert(rng.choice([setup.block_rows, setup.block_rows - 1, 0]) if short else setup.block_rows)
         if rng.random() < loss:
             before = pacer.state
-            pacer.lost(rng.choice([0.1, 0.5, 1.0]))
+            pacer.write_off(rng.choice([0.1, 0.5, 1.0]))
             assert pacer.state.written_off >= before.written_off
-            if "update" in under_way:
-                under_way.remove("update")
-                pacer.not_sampled(setup.updates_per_call)
+            if "update" in in_flight:
+                in_flight.remove("update")
+                pacer.undo_sample(setup.updates_per_call)
         ahead = pacer.state.inserted * setup.samples_per_insert - pacer.state.sampled - pacer.state.written_off
         assert ahead <= highest + (calls * setup.batch_size * setup.updates_per_call if loss else 0) + 1e-6
         assert loss or ahead >= lowest - 1e-6 or not pacer.state.sampled
@@ -85,43 +85,43 @@ def test_losses_do_not_deadlock(setup, calls, seed):
     simulate(setup, calls, seed, 300, loss=0.1)
 
 
-def test_after_the_loss_of_all_the_replay_fills_up_as_at_the_start():
+def test_after_the_loss_of_the_whole_replay_it_fills_up_as_at_the_start():
     pacer = Pacer(*Setup(2.0, 100, 10, 5, 20, 2))
     for _ in range(9):
-        pacer.inserted(20)
+        pacer.record_insert(20)
     while pacer.updates_due():
-        pacer.sampling(5)
-    pacer.lost(1.0)
+        pacer.record_sample(5)
+    pacer.write_off(1.0)
     held = 0
     while not pacer.updates_due():
         assert pacer.may_collect(0)
-        pacer.inserted(20)
+        pacer.record_insert(20)
         held += 20
     assert held == 100  # min_replay
 
 
-def test_new_transitions_are_sampled_as_often_whatever_was_lost():
-    """What is inserted after a loss gets samples_per_insert samples; what was lost is not made up for."""
+def test_new_transitions_are_sampled_at_the_ratio_whatever_was_lost():
+    """Transitions inserted after a loss get samples_per_insert samples each, and none in place of lost ones."""
     pacer = Pacer(*Setup(2.0, 100, 10, 1, 20, 1))
     lost_at = {40: 1.0, 80: 0.5}
     sampled = {}
     for i in range(2_000):
         if i in lost_at:
-            pacer.lost(lost_at[i])
-        pacer.inserted(20)
+            pacer.write_off(lost_at[i])
+        pacer.record_insert(20)
         while pacer.updates_due():
-            pacer.sampling(1)
+            pacer.record_sample(1)
         sampled[i] = pacer.state.sampled
     assert (sampled[1_999] - sampled[999]) / (1_000 * 20) == pytest.approx(2.0, rel=1e-3)
     assert pacer.ratio() < 2.0
 
 
-def test_updates_that_could_not_be_made_are_taken_back():
+def test_the_samples_of_failed_updates_are_taken_back():
     pacer = Pacer(*Setup(4.0, 1, 8, 1, 8, 1))
-    pacer.inserted(8)
+    pacer.record_insert(8)
     before = pacer.state
-    pacer.sampling(3)
-    pacer.not_sampled(3)
+    pacer.record_sample(3)
+    pacer.undo_sample(3)
     assert pacer.state == before
 
 
@@ -138,7 +138,7 @@ def test_the_ratio_converges_within_the_band(calls, seed, ratio):
     pacer = simulate(setup, calls, seed, 3000)
     lowest, highest = band(setup)
     state = pacer.state
-    assert state.sampled > 20 * max(abs(lowest), highest)  # both sides went on
+    assert state.sampled > 20 * max(abs(lowest), highest)  # both sides made progress
     assert ratio - highest / state.inserted - 1e-9 <= pacer.ratio() <= ratio - lowest / state.inserted + 1e-9
     assert pacer.ratio() == pytest.approx(ratio, rel=0.06)
 
@@ -147,38 +147,38 @@ def test_a_stalled_learner_stops_the_workers_and_the_other_way_round():
     setup = Setup(2.0, 100, 10, 5, 20, 2)
     pacer = Pacer(*setup)
     while pacer.may_collect(0):
-        pacer.inserted(20)
+        pacer.record_insert(20)
     # 2 x inserted must stay within 200 + 2 x 50 + 2 x 20 x 2 = 380.
     assert pacer.state.inserted == 180
     calls = 0
     while pacer.updates_due():
-        pacer.sampling(5)
+        pacer.record_sample(5)
         calls += 1
     assert calls == 4 and pacer.state.sampled == 200  # 360 - 200 = 160 is below 200
 
 
-def test_nothing_is_sampled_before_the_start_size():
+def test_nothing_is_sampled_before_min_replay():
     pacer = Pacer(*Setup(4.0, 100, 1, 1, 1, 1))
-    pacer.inserted(99)
+    pacer.record_insert(99)
     assert pacer.updates_due() == 0
-    pacer.inserted(1)
+    pacer.record_insert(1)
     assert pacer.updates_due() == 1
 
 
-def test_blocks_under_way_count_as_inserted():
+def test_blocks_in_flight_count_as_inserted():
     pacer = Pacer(*Setup(1.0, 10, 1, 1, 10, 3))  # at most 10 + 2 + 30 = 42
-    assert [pacer.may_collect(under_way) for under_way in range(5)] == [True, True, True, True, False]
-    pacer.inserted(10)
-    assert [pacer.may_collect(under_way) for under_way in range(4)] == [True, True, True, False]
+    assert [pacer.may_collect(in_flight) for in_flight in range(5)] == [True, True, True, True, False]
+    pacer.record_insert(10)
+    assert [pacer.may_collect(in_flight) for in_flight in range(4)] == [True, True, True, False]
 
 
 @given(setup=setups, seed=st.integers(0, 99))
 @settings(max_examples=30, deadline=None)
-def test_a_saved_state_decides_the_same(setup, seed):
+def test_a_restored_state_decides_the_same(setup, seed):
     pacer = simulate(setup, 1, seed, 60)
-    pacer.waited(to_insert=True)
-    pacer.waited(to_insert=False)
-    pacer.waited(to_insert=False)
+    pacer.record_wait(to_insert=True)
+    pacer.record_wait(to_insert=False)
+    pacer.record_wait(to_insert=False)
     resumed = Pacer(*setup)
     resumed.state = PacingState(**pacer.state._asdict())
     assert resumed.state == pacer.state and pacer.state[2:4] == (1, 2)
@@ -186,15 +186,15 @@ def test_a_saved_state_decides_the_same(setup, seed):
         assert resumed.updates_due() == pacer.updates_due()
         assert [resumed.may_collect(i) for i in range(4)] == [pacer.may_collect(i) for i in range(4)]
         for one in (pacer, resumed):
-            one.sampling(one.updates_due())
-            one.inserted(setup.block_rows)
+            one.record_sample(one.updates_due())
+            one.record_insert(setup.block_rows)
 
 
 def test_the_ratio_is_unknown_before_the_first_insert():
     pacer = Pacer(*Setup(4.0, 1, 8, 1, 8, 1))
     assert math.isnan(pacer.ratio())
-    pacer.inserted(8)
-    pacer.sampling(3)
+    pacer.record_insert(8)
+    pacer.record_sample(3)
     assert pacer.ratio() == 3.0
 
 

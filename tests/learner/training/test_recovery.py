@@ -1,4 +1,4 @@
-"""Recovery in one process: whatever fails and whenever, the run ends, learns, and its accounts balance."""
+"""Recovery in one process: whatever fails, and whenever, the run finishes, learns, and its accounts balance."""
 
 import dataclasses
 import threading
@@ -12,11 +12,10 @@ from actors.rollout import node as rollout_node
 from actors.rollout.node import RolloutNode
 from actors.service.fault_policy import Action, ComponentKind, Fault, FaultTracker, RunFailed
 from learner.checkpoints.checkpoint import newest_valid
-from learner.checkpoints.writer import Checkpointer
+from learner.checkpoints.writer import CheckpointWriter
 from learner.loop import TrainingLoop
 from learner.tracking.journal import Journal
-from learner.training import cluster as cluster_module
-from learner.training.cluster import process_cluster
+from learner.training.cluster import ProcessCluster, rollout_settings
 from learner.training.recovery import RunLost
 from learner.update.learner_node import LearnerNode
 from tests.learner.failing_calls import FailingCalls
@@ -26,7 +25,7 @@ KINDS = ("dies before", "dies after", "unreachable before", "unreachable after")
 
 class Listener:
     def __init__(self):
-        self.failures, self.mends, self.rows, self.checkpoints, self.unwritten = [], [], [], [], []
+        self.failures, self.recoveries, self.rows, self.checkpoints, self.unwritten = [], [], [], [], []
 
     def row(self, row):
         self.rows.append(row)
@@ -40,8 +39,8 @@ class Listener:
     def failed(self, failure, decision):
         self.failures.append((failure, decision))
 
-    def mended(self, mended):
-        self.mends.append(mended)
+    def recovered(self, recovered):
+        self.recoveries.append(recovered)
 
 
 @pytest.fixture
@@ -65,20 +64,20 @@ def config(small_run):
 def run(monkeypatch, tmp_path):
     """Function: trains with a fault function; gives (loop, calls, listener, cluster).
 
-    Unless it is `free_running`, training waits for its checkpoints, so that every run is like the last one.
+    Training waits for its checkpoints, and is thus deterministic, unless it is `free_running`.
     """
-    start = Checkpointer._start
+    start = CheckpointWriter._start
 
-    def start_and_wait(checkpointer, *args):
-        start(checkpointer, *args)
-        checkpointer._thread.join()
+    def start_and_wait(writer, *args):
+        start(writer, *args)
+        writer._thread.join()
 
     def train(config, fault, seed=0, free_running=False):
         if not free_running:
-            monkeypatch.setattr(Checkpointer, "_start", start_and_wait)
+            monkeypatch.setattr(CheckpointWriter, "_start", start_and_wait)
         calls = FailingCalls(fault, seed)
-        monkeypatch.setattr(cluster_module, "LocalCalls", lambda: calls)
-        cluster = process_cluster(config, 0)._replace(collects_in_flight=2, blocks_in_flight=2 * config.workers)
+        cluster = ProcessCluster(config, 0, calls)
+        cluster.limits = cluster.limits._replace(collects_in_flight=2, blocks_in_flight=2 * config.workers)
         listener = Listener()
         with closing(Journal(tmp_path / "metrics.jsonl", 0)) as journal:
             loop = TrainingLoop(config, cluster, journal, tmp_path / "checkpoints", listener, bool, FaultTracker())
@@ -91,7 +90,7 @@ def run(monkeypatch, tmp_path):
 def at_random(seed, rate, kinds, nodes):
     """A fault function: a call of one of the node classes fails with probability `rate`.
 
-    Not `saved`, which is asked as often as the disk is slow.
+    Calls of `saved` do not: their number depends on the speed of the disk.
     """
     rng = np.random.default_rng(seed)
 
@@ -117,7 +116,7 @@ def once(node_class, method, kind, number=3):
 
 def assert_accounts(loop, listener, config):
     ledger, pacing = loop._progress.ledger, loop._progress.pacer.state
-    assert ledger.balances
+    assert ledger.produced == ledger.stored + sum(ledger.dropped.values())
     assert (pacing.inserted, pacing.sampled) == (ledger.stored, loop.updates * config.batch_size)
     for row in listener.rows:
         metrics = row.metrics
@@ -127,10 +126,10 @@ def assert_accounts(loop, listener, config):
     lowest = config.min_replay * config.samples_per_insert
     call = config.batch_size * config.updates_per_call
     highest = lowest + 2 * call + 2 * config.workers * config.block_env_steps * config.samples_per_insert
-    assert ahead <= highest + call  # updates that failed are taken back
+    assert ahead <= highest + call  # the samples of failed updates are taken back
 
 
-def test_a_run_without_faults_has_nothing_to_mend(run, config):
+def test_a_run_without_faults_recovers_from_nothing(run, config):
     loop, calls, listener, cluster = run(config, lambda node, method: None)
     assert not listener.failures and calls.faults == 0
     assert sum(loop._progress.ledger.dropped.values()) == 0
@@ -191,18 +190,16 @@ def test_a_restarted_worker_has_a_new_incarnation_fresh_streams_and_the_current_
     incarnations = [worker._worker._incarnation for worker in cluster.workers]
     assert incarnations == [1 if i == worker_id else 0 for i in range(3)]
     assert cluster.workers[worker_id]._worker.policy_version > 0
-    assert [mended.component for mended in listener.mends] == [failure.component]
+    assert [recovered.component for recovered in listener.recoveries] == [failure.component]
     state = newest_valid(tmp_path / "checkpoints")[0].state
     assert state["incarnation"] == 1
 
 
-def test_the_old_incarnation_of_a_worker_is_refused_everywhere(run, config):
+def test_every_shard_refuses_the_old_incarnation_of_a_worker(run, config):
     loop, calls, listener, cluster = run(config, once(RolloutNode, "collect", "unreachable after", 10))
     ((failure, _),) = listener.failures
     stored = loop._progress.ledger.stored
-    zombie = RolloutNode(
-        cluster_module.rollout_settings(config), failure.component.number, 0, calls, cluster.targets, 0
-    )
+    zombie = RolloutNode(rollout_settings(config), failure.component.number, 0, calls, cluster.targets, 0)
     zombie.set_weights(loop.newest_weights())
     zombie._worker._sequence = 1_000  # blocks that no shard has seen
     for _ in range(3):
@@ -217,7 +214,7 @@ def test_a_lost_learner_ends_the_attempt(run, config):
     assert lost.value.incarnation == 0 and "learner died" in str(lost.value)
 
 
-def test_a_part_that_fails_again_and_again_ends_the_run_with_its_name(run, config):
+def test_a_component_that_fails_again_and_again_ends_the_run_and_is_named(run, config):
     def fault(node, method):
         second = isinstance(node, RolloutNode) and node._worker._worker_id == 1
         return "dies before" if second and method == "collect" else None
@@ -226,7 +223,7 @@ def test_a_part_that_fails_again_and_again_ends_the_run_with_its_name(run, confi
         run(dataclasses.replace(config, total_env_steps=100_000), fault)
 
 
-def test_the_only_shard_may_be_lost_again_and_again(run, config):
+def test_the_only_shard_may_be_lost_repeatedly(run, config):
     config = dataclasses.replace(config, replay_shards=1)
     fault = at_random(1, 0.02, ("dies before",), ShardNode)
     loop, calls, listener, cluster = run(config, fault)
@@ -264,7 +261,7 @@ def test_a_shard_lost_while_a_worker_is_being_replaced_is_replaced_first(run, co
     ],
 )
 @pytest.mark.parametrize("kind", ["dies before", "dies after"])
-def test_a_part_lost_during_a_checkpoint_does_not_spoil_it(run, config, tmp_path, node_class, method, kind):
+def test_a_component_lost_during_a_checkpoint_does_not_corrupt_it(run, config, tmp_path, node_class, method, kind):
     loop, _, listener, _ = run(config, once(node_class, method, kind, 0))
     assert len(listener.failures) == 1
     assert len(listener.unwritten) == (0 if method == "settle" else 1)
@@ -274,7 +271,7 @@ def test_a_part_lost_during_a_checkpoint_does_not_spoil_it(run, config, tmp_path
 
 
 @pytest.mark.parametrize("method", ["save", "saved"])
-def test_a_part_lost_during_the_last_checkpoint_costs_another_one(run, config, tmp_path, method):
+def test_a_component_lost_during_the_last_checkpoint_causes_another_one(run, config, tmp_path, method):
     config = dataclasses.replace(config, checkpoint_every_env_steps=100_000)
     loop, _, listener, _ = run(config, once(RolloutNode, method, "dies before", 1))
     assert len(listener.failures) == len(listener.unwritten) == 1
@@ -297,8 +294,8 @@ def test_a_learner_lost_while_it_is_saved_ends_the_attempt_and_older_checkpoints
     assert 1_000 <= found.state["env_steps"] < 2_000 and not skipped
 
 
-def test_what_a_part_that_was_given_up_writes_later_is_in_no_checkpoint(run, config, tmp_path, monkeypatch):
-    """The first worker hangs while it writes, counts as lost, and goes on to write once its checkpoint is whole."""
+def test_late_writes_of_a_replaced_component_are_in_no_checkpoint(run, config, tmp_path, monkeypatch):
+    """The first worker hangs while it writes, is replaced, and writes on once the checkpoint is complete."""
     go_on, stuck = threading.Event(), []
 
     def fault(node, method):
@@ -327,7 +324,7 @@ def test_what_a_part_that_was_given_up_writes_later_is_in_no_checkpoint(run, con
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_parts_fail_while_training_goes_on_and_checkpoints_are_written(run, config, tmp_path, seed):
+def test_components_fail_while_training_goes_on_and_checkpoints_are_written(run, config, tmp_path, seed):
     config = dataclasses.replace(config, checkpoint_every_env_steps=300)
     rng = np.random.default_rng(seed)
 

@@ -1,4 +1,4 @@
-"""Stopping on signals: the first asks, a second Ctrl-C interrupts, and the old handlers come back."""
+"""Stop signals: the first requests a stop, a second Ctrl-C interrupts, and the old handlers are restored."""
 
 import os
 import signal
@@ -19,7 +19,7 @@ def test_a_signal_is_remembered(number):
 
 
 @pytest.mark.parametrize("first", NUMBERS)
-def test_a_second_interrupt_does_not_wait(first):
+def test_a_second_interrupt_ends_the_run_at_once(first):
     with pytest.raises(KeyboardInterrupt), stop_on_signals():
         os.kill(os.getpid(), first)
         os.kill(os.getpid(), signal.SIGINT)
@@ -33,7 +33,7 @@ def test_a_second_sigterm_still_lets_the_run_save():
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError, KeyboardInterrupt])
-def test_the_handlers_of_before_come_back(error):
+def test_the_old_handlers_are_restored(error):
     def mine(number, frame):
         raise AssertionError("not called")
 

@@ -1,4 +1,6 @@
-"""Compiled updates are those of PyTorch's autograd and Adam, whatever the network's shape and the options."""
+"""Compiled updates equal those of PyTorch's autograd and Adam, for any shape of network and any options."""
+
+import dataclasses
 
 import numpy as np
 import pytest
@@ -11,15 +13,16 @@ from learner.update.updates import TorchUpdates
 
 SHAPES = [((16,), (64, 64), 8, 64), ((72,), (256, 256), 9, 32), ((3,), (5,), 2, 1), ((2, 4), (7, 6, 5), 4, 33)]
 RATE = 1e-3
+SOFT = {"target_update": "soft", "target_update_rate": 0.1}
 
 
-def maker(ways, settings):
+def maker(ways, config, shape, num_actions):
     """(updates by `ways`, online network, target network, optimiser), the same at every call."""
     torch.manual_seed(0)
-    sizes = (settings.observation_size, settings.hidden_sizes, settings.num_actions)
+    sizes = (int(np.prod(shape)), config.hidden_sizes, num_actions)
     online, target = FlatNetwork(QNetwork(*sizes)), FlatNetwork(QNetwork(*sizes))
     optimiser = torch.optim.Adam([online.values], fused=True)
-    return ways(online, target, optimiser, settings), online, target, optimiser
+    return ways(online, target, optimiser, config), online, target, optimiser
 
 
 def columns_of(count, shape, num_actions, seed=0, weighted=False):
@@ -27,7 +30,7 @@ def columns_of(count, shape, num_actions, seed=0, weighted=False):
     found = {
         "observation": rng.normal(size=(count, *shape)),
         "next_observation": rng.normal(size=(count, *shape)),
-        "reward": rng.normal(scale=2, size=count),  # TD errors on both sides of Huber's corner
+        "reward": rng.normal(scale=2, size=count),  # TD errors on both sides of |d| = 1, where Huber's loss changes
         "discount": rng.choice([0.0, 0.97], size=count),
     }
     if weighted:
@@ -36,27 +39,17 @@ def columns_of(count, shape, num_actions, seed=0, weighted=False):
     return tensors | {"action": torch.from_numpy(rng.integers(num_actions, size=count))}
 
 
-def settings_of(learner_settings, shape, hidden_sizes, num_actions, batch_size, **others):
-    return learner_settings._replace(
-        observation_size=int(np.prod(shape)),
-        hidden_sizes=hidden_sizes,
-        num_actions=num_actions,
-        batch_size=batch_size,
-        gradients="autograd",
-        **others,
-    )
-
-
 @pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("options", [{}, {"loss": "mse"}, {"soft_target_rate": 0.1}, {"max_gradient_norm": 100.0}])
-@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize("options", [{}, {"loss": "mse"}, SOFT, {"max_gradient_norm": 100.0}])
+@pytest.mark.parametrize("algorithm", ["double_dqn", "dqn"])
 @pytest.mark.parametrize(("shape", "hidden_sizes", "num_actions", "size"), SHAPES)
-def test_an_update_is_that_of_autograd(
-    learner_settings, shape, hidden_sizes, num_actions, size, double, options, weighted
+def test_an_update_equals_that_of_autograd(
+    learner_config, shape, hidden_sizes, num_actions, size, algorithm, options, weighted
 ):
-    settings = settings_of(learner_settings, shape, hidden_sizes, num_actions, size, double=double, **options)
-    compiled, online, target, optimiser = maker(CompiledUpdates, settings)
-    plain, other_online, other_target, other_optimiser = maker(TorchUpdates, settings)
+    settings = {"hidden_sizes": hidden_sizes, "batch_size": size, "algorithm": algorithm, "gradients": "autograd"}
+    config = dataclasses.replace(learner_config, **settings, **options)
+    compiled, online, target, optimiser = maker(CompiledUpdates, config, shape, num_actions)
+    plain, other_online, other_target, other_optimiser = maker(TorchUpdates, config, shape, num_actions)
     columns = columns_of(5 * size, shape, num_actions, weighted=weighted)
     stats, errors = compiled(columns, RATE, 7)
     expected, expected_errors = plain(columns, RATE, 7)
@@ -72,12 +65,12 @@ def test_an_update_is_that_of_autograd(
         torch.testing.assert_close(state[name], other_state[name], rtol=1e-3, atol=1e-5 * largest)
     for flat, other in ((online, other_online), (target, other_target)):
         apart = (flat.values - other.values).detach().abs().mean()
-        assert float(apart) < 1e-3 * RATE  # Adam's step of a gradient of nearly nothing may be of either sign
+        assert float(apart) < 1e-3 * RATE  # Adam's step for a gradient near 0 may have either sign
 
 
 @pytest.mark.parametrize("change", [torch.nan, torch.inf])
-def test_what_diverged_shows(learner_settings, change):
-    compiled, online, _, _ = maker(CompiledUpdates, settings_of(learner_settings, (6,), (8, 8), 3, 16))
+def test_divergence_shows_in_the_statistics(learner_config, change):
+    compiled, online, _, _ = maker(CompiledUpdates, dataclasses.replace(learner_config, hidden_sizes=(8, 8)), (6,), 3)
     columns = columns_of(16, (6,), 3)
     columns["reward"][3] = change
     stats, errors = compiled(columns, RATE, 0)
@@ -87,16 +80,16 @@ def test_what_diverged_shows(learner_settings, change):
         assert online.values.detach().isnan().all()
 
 
-def test_ties_are_broken_as_by_pytorch(learner_settings):
-    settings = settings_of(learner_settings, (6,), (8,), 3, 16)
-    compiled, online, target, _ = maker(CompiledUpdates, settings)
-    plain, other, _, _ = maker(TorchUpdates, settings)
+def test_ties_are_broken_as_by_pytorch(learner_config):
+    config = dataclasses.replace(learner_config, hidden_sizes=(8,), gradients="autograd")
+    compiled, online, target, _ = maker(CompiledUpdates, config, (6,), 3)
+    plain, other, _, _ = maker(TorchUpdates, config, (6,), 3)
     for network in (online, other):
-        network.values.data.zero_()  # every action is worth as much; the target network tells them apart
+        network.values.data.zero_()  # all actions are tied online; the target network tells them apart
     columns = columns_of(16, (6,), 3)
     errors = compiled(columns, RATE, 0)[1]
     np.testing.assert_allclose(errors, plain(columns, RATE, 0)[1], rtol=1e-5, atol=1e-6)
     values = target.network(columns["next_observation"])
     assert np.ptp(values.detach().numpy(), axis=1).min() > 1e-3
-    goals = columns["reward"] + columns["discount"] * values[:, 0]
-    np.testing.assert_allclose(errors, goals.detach().numpy(), rtol=1e-5, atol=1e-6)
+    td_targets = columns["reward"] + columns["discount"] * values[:, 0]
+    np.testing.assert_allclose(errors, td_targets.detach().numpy(), rtol=1e-5, atol=1e-6)

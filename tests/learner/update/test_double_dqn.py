@@ -1,10 +1,10 @@
-"""Targets and loss against hand-computed numbers and brute force."""
+"""TD targets, losses and importance weights against numbers computed by hand and brute force."""
 
 import numpy as np
 import pytest
 import torch
 
-from learner.update.double_dqn import as_batch, double_q_target, importance_weights, mean_loss, q_target, targets
+from learner.update.double_dqn import importance_weights, mean_loss, minibatch, td_targets
 
 # Row 0: both networks prefer action 1. Row 1: online prefers 0, target 2 - there the algorithms differ.
 ONLINE = torch.tensor([[1.0, 3.0, 2.0], [5.0, 4.0, 1.0]])
@@ -14,24 +14,24 @@ REWARD, DISCOUNT = torch.tensor([0.5, -1.0]), torch.tensor([0.9, 0.5])
 
 def test_double_dqn_by_hand():
     expected = [0.5 + 0.9 * 30, -1.0 + 0.5 * -1.0]
-    assert double_q_target(ONLINE, TARGET, REWARD, DISCOUNT).tolist() == pytest.approx(expected)
+    assert td_targets(TARGET, ONLINE, REWARD, DISCOUNT).tolist() == pytest.approx(expected)
 
 
 def test_dqn_by_hand():
     expected = [0.5 + 0.9 * 30, -1.0 + 0.5 * 8.0]
-    assert q_target(TARGET, REWARD, DISCOUNT).tolist() == pytest.approx(expected)
+    assert td_targets(TARGET, TARGET, REWARD, DISCOUNT).tolist() == pytest.approx(expected)
 
 
-def test_they_agree_exactly_where_both_networks_prefer_the_same():
-    equal = double_q_target(ONLINE, TARGET, REWARD, DISCOUNT) == q_target(TARGET, REWARD, DISCOUNT)
+def test_both_algorithms_agree_where_both_networks_prefer_the_same_action():
+    equal = td_targets(TARGET, ONLINE, REWARD, DISCOUNT) == td_targets(TARGET, TARGET, REWARD, DISCOUNT)
     assert equal.tolist() == [True, False]
-    assert torch.equal(double_q_target(TARGET, TARGET, REWARD, DISCOUNT), q_target(TARGET, REWARD, DISCOUNT))
+    assert torch.equal(td_targets(TARGET, TARGET, REWARD, DISCOUNT), REWARD + DISCOUNT * TARGET.amax(dim=1))
 
 
 def test_a_discount_of_0_leaves_the_reward():
     zero = torch.zeros(2)
-    assert torch.equal(double_q_target(ONLINE, TARGET, REWARD, zero), REWARD)
-    assert torch.equal(q_target(TARGET, REWARD, zero), REWARD)
+    assert torch.equal(td_targets(TARGET, ONLINE, REWARD, zero), REWARD)
+    assert torch.equal(td_targets(TARGET, TARGET, REWARD, zero), REWARD)
 
 
 @pytest.mark.parametrize("double", [True, False])
@@ -47,13 +47,13 @@ def test_targets_equal_a_loop(make_rows, double):
     for i, row in enumerate(rows):
         best = max(range(4), key=lambda a, i=i: values[0 if double else 1][i][a])
         expected.append(row["reward"] + row["discount"] * values[1][i][best])
-    batch = as_batch({name: torch.from_numpy(rows[name].astype(np.float32)) for name in rows.dtype.names}, slice(0, 40))
-    result = targets(batch, online, target, double)
+    reward, discount, s_t = (torch.from_numpy(rows[name].copy()) for name in ("reward", "discount", "next_observation"))
+    with torch.no_grad():
+        result = td_targets(target(s_t), (online if double else target)(s_t), reward, discount)
     np.testing.assert_allclose(result.numpy(), expected, rtol=1e-5, atol=1e-5)
-    assert not result.requires_grad
 
 
-def test_loss_is_the_mean_mean_loss_of_the_taken_actions():
+def test_the_loss_is_the_mean_huber_loss_of_the_taken_actions():
     q_tm1 = torch.tensor([[0.0, 9.0], [9.0, 1.0], [2.0, 9.0]])
     target = torch.tensor([0.5, 4.0, -0.25])
     loss, td_error = mean_loss(q_tm1, torch.tensor([0, 1, 0]), target)
@@ -61,7 +61,7 @@ def test_loss_is_the_mean_mean_loss_of_the_taken_actions():
     assert loss.item() == pytest.approx((0.5 * 0.25 + (3.0 - 0.5) + (2.25 - 0.5)) / 3)
 
 
-def test_mean_square_of_the_taken_actions_errors_by_hand():
+def test_the_mean_squared_error_of_the_taken_actions_by_hand():
     q_tm1 = torch.tensor([[0.0, 9.0], [9.0, 1.0]])
     target, weight = torch.tensor([0.5, 4.0]), torch.tensor([1.0, 0.1])
     assert mean_loss(q_tm1, torch.tensor([0, 1]), target, "mse")[0].item() == pytest.approx((0.25 + 9) / 2)
@@ -87,14 +87,14 @@ def test_loss_and_gradient_equal_the_closed_form(name, weighted):
 
 
 def test_importance_weights_by_hand():
-    """Four stored transitions, minibatches of two: 1 / (4 P) to the power of beta, over the minibatch's greatest."""
+    """Four stored transitions, minibatches of two: 1 / (4 P) to the power of beta, scaled to a greatest of 1."""
     weights = importance_weights(np.array([0.5, 0.25, 0.125, 0.125]), 2, 0.5)
     assert weights.dtype == np.float32
     assert weights.tolist() == pytest.approx([2**-0.5, 1, 1, 1])
     np.testing.assert_array_equal(importance_weights(np.array([0.5, 0.25]), 2, 0.0), [1, 1])
 
 
-def test_importance_weights_are_the_papers():
+def test_importance_weights_equal_the_formula_of_the_paper():
     rng = np.random.default_rng(0)
     stored = rng.uniform(0.01, 1.0, 1000)
     stored /= stored.sum()
@@ -105,7 +105,7 @@ def test_importance_weights_are_the_papers():
         np.testing.assert_allclose(importance_weights(drawn.ravel(), 32, exponent).reshape(5, 32), expected, rtol=1e-6)
 
 
-def test_whole_importance_weights_take_all_of_the_bias_away():
+def test_importance_weights_with_beta_1_remove_all_of_the_bias():
     """beta = 1: the weighted mean over prioritised draws is the plain mean over all that is stored."""
     rng = np.random.default_rng(1)
     values = rng.normal(size=50)
@@ -115,7 +115,7 @@ def test_whole_importance_weights_take_all_of_the_bias_away():
     spread = values[drawn] * weights
     error = 4 * spread.std() / np.sqrt(200_000) / weights.mean()
     assert spread.mean() / weights.mean() == pytest.approx(values.mean(), abs=error)
-    assert abs(values[drawn].mean() - values.mean()) > 5 * error  # or nothing would be tested
+    assert abs(values[drawn].mean() - values.mean()) > 5 * error  # else nothing would be tested
 
 
 def test_no_gradient_flows_into_the_target():
@@ -126,13 +126,13 @@ def test_no_gradient_flows_into_the_target():
     assert not td_error.requires_grad
 
 
-def test_a_minibatch_is_its_slice(make_rows):
+def test_a_minibatch_is_a_slice_of_the_columns(make_rows):
     columns = {name: torch.from_numpy(make_rows(10)[name].copy()) for name in make_rows(10).dtype.names}
-    batch = as_batch(columns, slice(4, 7))
+    batch = minibatch(columns, slice(4, 7))
     rows = make_rows(10)[4:7]
     names = ("observation", "action", "reward", "discount", "next_observation")
     for tensor, name in zip(batch[:5], names, strict=True):
         np.testing.assert_array_equal(tensor.numpy(), rows[name])
     assert batch.weight is None
     columns["weight"] = torch.arange(10.0)
-    assert as_batch(columns, slice(4, 7)).weight.tolist() == [4.0, 5.0, 6.0]
+    assert minibatch(columns, slice(4, 7)).weight.tolist() == [4.0, 5.0, 6.0]

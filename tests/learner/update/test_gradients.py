@@ -1,4 +1,4 @@
-"""Gradients written by hand are autograd's, whatever the network's shape, and flat parameters are the network's own."""
+"""Hand-written gradients equal those of autograd for any shape of network; flat parameters are the network's own."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def random_batch(size, shape, num_actions, seed=0, weighted=False):
     return Batch(
         s_tm1=tensor(rng.normal(size=(size, *shape))),
         a_tm1=torch.from_numpy(rng.integers(num_actions, size=size)),
-        r_t=tensor(rng.normal(scale=2, size=size)),  # TD errors on both sides of Huber's corner
+        r_t=tensor(rng.normal(scale=2, size=size)),  # TD errors on both sides of |d| = 1, where Huber's loss changes
         discount_t=tensor(rng.choice([0.0, 0.97], size=size)),
         s_t=tensor(rng.normal(size=(size, *shape))),
         weight=tensor(rng.uniform(0.1, 1.0, size=size)) if weighted else None,
@@ -37,10 +37,10 @@ def random_batch(size, shape, num_actions, seed=0, weighted=False):
     ("shape", "hidden_sizes", "num_actions", "size"),
     [((16,), (128, 128), 8, 256), ((72,), (256, 256), 9, 64), ((3,), (5,), 2, 1), ((2, 4), (7, 6, 5), 4, 33)],
 )
-def test_by_hand_is_autograd(double, shape, hidden_sizes, num_actions, size, loss, weighted, kind):
+def test_hand_written_gradients_equal_autograd(double, shape, hidden_sizes, num_actions, size, loss, weighted, kind):
     online, target = networks(int(np.prod(shape)), hidden_sizes, num_actions, kind=kind)
     batch = random_batch(size, shape, num_actions, weighted=weighted)
-    online.values.grad.fill_(torch.nan)  # what is left of it would show
+    online.values.grad.fill_(torch.nan)  # an element that is not written would show
     found = HandWrittenGradients(online, target, double, loss)(batch)
     by_hand = online.values.grad.clone()
     online.values.grad.fill_(torch.nan)
@@ -54,7 +54,7 @@ def test_by_hand_is_autograd(double, shape, hidden_sizes, num_actions, size, los
 
 @pytest.mark.parametrize("kind", ["plain", "dueling"])
 @pytest.mark.parametrize(("loss", "weighted"), [("huber", False), ("mse", True)])
-def test_by_hand_is_the_quotient_of_differences(kind, loss, weighted):
+def test_hand_written_gradients_equal_finite_differences(kind, loss, weighted):
     online, target = networks(4, (6, 5), 3, seed=2, kind=kind)
     for flat in (online, target):
         flat.network.double()
@@ -74,7 +74,7 @@ def test_by_hand_is_the_quotient_of_differences(kind, loss, weighted):
 
 
 @pytest.mark.parametrize("kind", ["plain", "dueling"])
-def test_flat_parameters_are_the_networks(kind):
+def test_flat_parameters_are_those_of_the_network(kind):
     flat, _ = networks(3, (4,), 2, kind=kind)
     before = [parameter.detach().clone() for parameter in flat.network.parameters()]
     assert torch.equal(flat.values.data, torch.cat([parameter.reshape(-1) for parameter in before]))
@@ -85,7 +85,7 @@ def test_flat_parameters_are_the_networks(kind):
     assert (flat.values == 3).all() and all((weight == 3).all() and (bias == 3).all() for weight, bias in flat.layers)
 
 
-def test_a_copy_is_of_its_own():
+def test_a_copy_is_independent():
     flat, _ = networks(3, (4,), 2)
     other = flat.copy()
     assert torch.equal(other.values, flat.values)

@@ -1,5 +1,6 @@
-"""The learner's node: sampling over shards, publication, state; and one contract for both placements of a shard."""
+"""The node of the learner: sampling over shards, publication, state; and the contract of whatever workers push to."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -29,24 +30,25 @@ def make_block(rows, sequence=0, worker_id=0, incarnation=0, version=0, schema=S
 
 
 @pytest.fixture
-def make_learner(learner_settings, make_rows):
+def make_learner(learner_config, learner_shape, make_rows):
     """Function: a learner with embedded shards; also gives the shards."""
 
     def make(num_shards=1, capacity=50, priorities=None, calls=None, **other):
         settings = [ShardSettings(make_rows(0).dtype, capacity, seed, priorities) for seed in range(num_shards)]
         shards = [ShardNode(setting) for setting in settings]
-        return LearnerNode(learner_settings._replace(**other), shards, calls or LocalCalls()), shards
+        config = dataclasses.replace(learner_config, **other)
+        return LearnerNode(config, learner_shape, shards, calls or LocalCalls()), shards
 
     return make
 
 
-def test_all_of_the_learners_time_counts_for_what_it_does(make_learner, make_rows, monkeypatch):
+def test_all_of_the_learners_time_is_attributed(make_learner, make_rows, monkeypatch):
     now = [100.0]
     monkeypatch.setattr(node_module, "Stopwatch", lambda: Stopwatch(lambda: now[0]))
     learner, shards = make_learner()
 
     def lasts(owner, method, seconds):
-        """Every call of this method takes so many seconds."""
+        """Makes every call of this method take that many seconds."""
         before = getattr(owner, method)
 
         def call(*args):
@@ -75,7 +77,7 @@ def test_all_of_the_learners_time_counts_for_what_it_does(make_learner, make_row
 
 
 class ShardContract:
-    """What a rollout node may expect of whatever it pushes to."""
+    """What a rollout worker may expect of any push target."""
 
     @pytest.fixture
     def target(self, make_learner):
@@ -119,7 +121,7 @@ class ShardContract:
         assert isinstance(weights, WeightsSnapshot) and weights.version == 2
 
 
-class TestShardInANodeOfItsOwn(ShardContract):
+class TestShardAsANode(ShardContract):
     priorities = None
 
     @pytest.fixture
@@ -133,7 +135,7 @@ class TestShardInANodeOfItsOwn(ShardContract):
         return node, node, publish
 
 
-class TestPrioritisedShardInANodeOfItsOwn(TestShardInANodeOfItsOwn):
+class TestPrioritisedShardAsANode(TestShardAsANode):
     priorities = PrioritySettings(0.6, 16)
 
 
@@ -208,7 +210,7 @@ def test_an_empty_shard_is_no_obstacle(make_learner, make_rows):
 
 @pytest.mark.parametrize("priorities", [None, PrioritySettings(0.6, 16)])
 @pytest.mark.parametrize("num_shards", [1, 3])
-def test_a_saved_node_goes_on_bit_by_bit(tmp_path, make_learner, make_rows, num_shards, priorities):
+def test_a_restored_node_goes_on_bit_for_bit(tmp_path, make_learner, make_rows, num_shards, priorities):
     learner, shards = make_learner(num_shards, priorities=priorities)
     for sequence in range(6):
         learner.add(make_block(make_rows(30, seed=sequence), sequence))
@@ -227,7 +229,7 @@ def test_a_saved_node_goes_on_bit_by_bit(tmp_path, make_learner, make_rows, num_
     assert [shard.add(make_block(make_rows(1), 9)).weights_version for shard in again] == [12] * num_shards
 
 
-def test_a_loaded_node_publishes_its_weights(tmp_path, make_learner, make_rows):
+def test_a_restored_node_publishes_its_weights(tmp_path, make_learner, make_rows):
     learner, (shard,) = make_learner()
     shard.add(make_block(make_rows(30)))
     learner.update(4, RATE)
@@ -260,20 +262,20 @@ HALF = PrioritySettings(0.5, 16)
 
 
 def numbered(make_rows, count, first):
-    """A block of rows whose rewards tell them apart."""
+    """Rows with distinct rewards, counted from `first`."""
     rows = make_rows(count, seed=first)
     rows["reward"] = first + np.arange(count)
     return rows
 
 
 def fill(learner, shards, make_rows, sizes):
-    """Rows with rewards 1000 x shard + number in every shard."""
+    """Fills every shard with rows whose rewards are 1000 x shard + number."""
     for i, (shard, size) in enumerate(zip(shards, sizes, strict=True)):
         shard.add(make_block(numbered(make_rows, size, 1000 * i)))
 
 
 def td_errors_by_hand(weights, rows):
-    """Of Double DQN before the first update, when both networks are the same: the best next value counts."""
+    """TD errors of Double DQN before the first update: both networks are equal, so the best next value counts."""
     policy = Policy(weights)
     best = policy.values(rows["next_observation"]).max(axis=1)
     return (
@@ -282,7 +284,7 @@ def td_errors_by_hand(weights, rows):
 
 
 @pytest.mark.parametrize("sizes", [(40,), (40, 10), (10, 30, 20)])
-def test_td_errors_go_back_to_the_rows_that_they_are_of(make_learner, make_rows, sizes):
+def test_td_errors_go_back_to_their_rows(make_learner, make_rows, sizes):
     learner, shards = make_learner(len(sizes), priorities=HALF)
     fill(learner, shards, make_rows, sizes)
     weights, sampled, real = learner.weights(), [], learner._samples.take
@@ -319,14 +321,14 @@ def test_rows_of_all_shards_are_drawn_in_proportion_to_their_priorities(make_lea
 
 
 @pytest.mark.parametrize("exponent", [0.0, 0.4, 1.0])
-def test_updates_count_their_rows_by_importance(make_learner, make_rows, learner_settings, exponent):
+def test_updates_weight_their_rows_by_importance(make_learner, make_rows, learner_config, learner_shape, exponent):
     learner, (shard,) = make_learner(priorities=HALF)
     twin, (other,) = make_learner(priorities=HALF)
     for copy in (shard, other):
         copy.add(make_block(make_rows(50)))
         copy.set_priorities(np.arange(50), np.geomspace(0.1, 9, 50).astype(np.float32))
     learner.update(3, RATE, exponent)
-    plain = Learner(learner_settings)
+    plain = Learner(learner_config, learner_shape)
     sample = other.sample(3 * 16)
     probability = other.shard.priorities[sample.draws.insertion_index] / other.shard.priorities.sum()
     plain.update(sample.columns, RATE, importance_weights(probability, 16, exponent))
@@ -335,18 +337,18 @@ def test_updates_count_their_rows_by_importance(make_learner, make_rows, learner
 
 
 class OvertakenCalls(LocalCalls):
-    """Stores a block before every answer, as a rollout worker may."""
+    """Stores a block before every priority update, as a rollout worker may do."""
 
     def __init__(self, blocks):
         self.blocks = blocks
 
     def start(self, node, method, *args):
-        if method == "set_priorities":
+        if method.__name__ == "set_priorities":
             node.add(next(self.blocks))
         return super().start(node, method, *args)
 
 
-def test_rows_that_were_overwritten_meanwhile_keep_their_successors_priorities(make_learner, make_rows):
+def test_priorities_of_overwritten_rows_do_not_reach_their_successors(make_learner, make_rows):
     blocks = iter([make_block(make_rows(50, seed=1), 1)])
     learner, (shard,) = make_learner(priorities=HALF, calls=OvertakenCalls(blocks))
     shard.add(make_block(make_rows(50)))
@@ -355,14 +357,14 @@ def test_rows_that_were_overwritten_meanwhile_keep_their_successors_priorities(m
     np.testing.assert_array_equal(shard.shard.priorities, np.ones(50))
 
 
-def test_a_checkpoint_waits_for_answers(tmp_path, make_learner, make_rows):
-    """Over Ray an answer is under way when `update` returns."""
+def test_a_checkpoint_waits_for_priority_updates(tmp_path, make_learner, make_rows):
+    """Over Ray a priority update is in flight when `update` returns."""
 
     class Late(LocalCalls):
         late = []
 
         def start(self, node, method, *args):
-            if method != "set_priorities":
+            if method.__name__ != "set_priorities":
                 return super().start(node, method, *args)
             self.late.append((node, args))
             return Done(len(self.late) - 1)
@@ -381,7 +383,7 @@ def test_a_checkpoint_waits_for_answers(tmp_path, make_learner, make_rows):
     assert shard.mass() != 50 and state["sizes"] == [shard.mass()]
 
 
-def test_learning_that_has_diverged_ends_the_run(make_learner, make_rows):
+def test_divergence_ends_the_run(make_learner, make_rows):
     learner, (shard,) = make_learner(priorities=HALF)
     rows = make_rows(50)
     rows["reward"] = np.inf

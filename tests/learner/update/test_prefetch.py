@@ -1,4 +1,4 @@
-"""The rows of the next call of updates are drawn while the learner makes those of this one."""
+"""Prefetching: the rows of the next call of updates are drawn while the learner makes those of this one."""
 
 import threading
 
@@ -18,13 +18,13 @@ WAIT_S = 60.0
 
 
 @pytest.fixture
-def make_learner(learner_settings, make_rows):
-    """Function: a learner that draws ahead from so many shards, and the shards."""
+def make_learner(learner_config, learner_shape, make_rows):
+    """Function: a learner that prefetches from `num_shards` shards, and the shards."""
 
     def make(num_shards=1, calls=None):
         dtype = make_rows(0).dtype
         shards = [ShardNode(ShardSettings(dtype, 100, seed)) for seed in range(num_shards)]
-        return LearnerNode(learner_settings, shards, calls or LocalCalls(), draws_ahead=True), shards
+        return LearnerNode(learner_config, learner_shape, shards, calls or LocalCalls(), prefetch=True), shards
 
     return make
 
@@ -35,14 +35,14 @@ def block(rows, sequence=0):
 
 
 def marked(make_rows, action):
-    """Rows that are known by their action."""
+    """Rows that are recognised by their action."""
     rows = make_rows(30)
     rows["action"] = action
     return rows
 
 
 def note_what_is_learned(learner, monkeypatch, before=lambda: None):
-    """Fills a list with the actions of every call of updates; `before` is called at its begin."""
+    """A list that receives the actions of every call of updates; `before` is called when one begins."""
     learned, update = [], learner._learner.update
 
     def note(columns, *rest):
@@ -65,7 +65,7 @@ def test_the_shards_draw_while_the_learner_computes(make_learner, make_rows, mon
 
     monkeypatch.setattr(shard, "sample", note_sample)
     learner.add(block(marked(make_rows, 0)))
-    calls = iter((2, 1, 1))  # the first call draws its own rows, too
+    calls = iter((2, 1, 1))  # the first call draws its own rows as well
 
     def wait_for_draws():
         assert all(drawn.acquire(timeout=WAIT_S) for _ in range(next(calls)))
@@ -76,7 +76,7 @@ def test_the_shards_draw_while_the_learner_computes(make_learner, make_rows, mon
     assert not drawn.acquire(blocking=False)
 
 
-def test_rows_that_come_during_a_call_are_drawn_in_the_one_after_the_next(make_learner, make_rows, monkeypatch):
+def test_rows_that_miss_a_prefetch_are_drawn_one_call_later(make_learner, make_rows, monkeypatch):
     learner, _ = make_learner()
     learned = note_what_is_learned(learner, monkeypatch)
     for sequence in range(3):
@@ -85,8 +85,8 @@ def test_rows_that_come_during_a_call_are_drawn_in_the_one_after_the_next(make_l
     assert learned == [{0}, {0}, {0, 1}]
 
 
-def test_nothing_is_drawn_between_two_calls(make_learner, make_rows, monkeypatch):
-    """A shard of this process is no place for two threads at once."""
+def test_no_draw_runs_between_two_calls(make_learner, make_rows, monkeypatch):
+    """A shard of this process must not be used by two threads at once."""
     learner, (shard,) = make_learner()
     learner.add(block(make_rows(30)))
     sample, computed, ended = shard.sample, threading.Event(), []
@@ -105,14 +105,14 @@ def test_nothing_is_drawn_between_two_calls(make_learner, make_rows, monkeypatch
     assert ended == [64, 64]
 
 
-def test_a_call_of_another_length_draws_its_own(make_learner, make_rows):
+def test_a_call_of_another_length_draws_its_own_rows(make_learner, make_rows):
     learner, _ = make_learner()
     learner.add(block(make_rows(30)))
     learner.update(4, RATE)
     assert learner.update(3, RATE).version == 7
 
 
-def test_what_a_checkpoint_holds_is_learned_from_alone(make_learner, make_rows, monkeypatch, tmp_path):
+def test_a_restored_learner_learns_from_the_restored_rows_alone(make_learner, make_rows, monkeypatch, tmp_path):
     learner, _ = make_learner()
     learner.add(block(marked(make_rows, 0)))
     state = saved(learner, tmp_path)
@@ -126,12 +126,12 @@ def test_what_a_checkpoint_holds_is_learned_from_alone(make_learner, make_rows, 
 
 
 class LosingCalls(LocalCalls):
-    """Loses what the node `loses` draws, from the second time on."""
+    """Loses the rows that the node `loses` draws, from the second draw on."""
 
     loses, drawn = None, 0
 
     def start(self, node, method, *args):
-        if method == "sample" and node is self.loses:
+        if method.__name__ == "sample" and node is self.loses:
             self.drawn += 1
             if self.drawn > 1:
                 return Done(self)
@@ -145,7 +145,7 @@ class LosingCalls(LocalCalls):
 
 @pytest.fixture
 def losing(make_learner, make_rows):
-    """A learner that has made a call of updates, after which one of its two shards could not draw."""
+    """A learner that has made one call of updates, during which the prefetch from one of its two shards failed."""
     calls = LosingCalls()
     learner, shards = make_learner(2, calls)
     for shard in shards:
@@ -155,13 +155,13 @@ def losing(make_learner, make_rows):
     return learner
 
 
-def test_a_shard_that_cannot_draw_ahead_is_named_before_more_is_learned(losing):
+def test_a_failed_prefetch_names_its_shard_before_another_update(losing):
     with pytest.raises(ComponentFailed) as failed:
         losing.update(4, RATE)
     assert failed.value.component.number == 1 and losing.weights().version == 4
 
 
-def test_a_shard_that_could_not_draw_ahead_is_forgotten_with_its_replacement(losing, make_learner):
+def test_a_failed_prefetch_is_forgotten_once_its_shard_is_replaced(losing, make_learner):
     fresh = make_learner()[1][0]
     losing.replace_shard(1, fresh, 1)
     assert losing.update(4, RATE).version == 8
