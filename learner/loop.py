@@ -16,7 +16,7 @@ from actors.service.fault_policy import CallFailed, Component, ComponentFailed, 
 from actors.service.messages import BlockReport, EpisodeStats
 from actors.storage.uri import Location
 from learner.checkpoints.checkpoint import Checkpoint
-from learner.checkpoints.writer import Checkpointer
+from learner.checkpoints.writer import CheckpointWriter
 from learner.config import RunConfig
 from learner.tracking.journal import Journal, Row
 from learner.training.cluster import Cluster
@@ -77,7 +77,7 @@ class TrainingLoop:
         self._progress = Progress(config, self._pacer, self._ledger)
         self._under_way = UnderWay(len(cluster.workers), cluster.deadline_s, cluster.start_deadline_s)
         self._mender = Mender(cluster, recovery or FaultTracker(), self._under_way, self._pacer, self._ledger, observer)
-        checkpointer = Checkpointer(checkpoints, cluster.calls, cluster.queue_deadline_s)
+        checkpointer = CheckpointWriter(checkpoints, cluster.calls, cluster.queue_deadline_s)
         self._saver = Saver(config, keep_best, checkpointer, self._mender, self._progress, journal, observer)
         self._restored = False
 

@@ -12,7 +12,7 @@ from actors.service.fault_policy import CallFailed, ComponentFailed, FaultTracke
 from actors.service.messages import EpisodeStats
 from actors.storage.uri import Location
 from learner.checkpoints.checkpoint import Checkpoint, check_config, check_state, newest_valid
-from learner.checkpoints.manifest import CheckpointError, UselessCheckpointError
+from learner.checkpoints.manifest import CheckpointError, UnusableCheckpointError
 from learner.config import RunConfig
 from learner.file_names import CONFIG
 from learner.loop import TrainingLoop
@@ -64,7 +64,7 @@ def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list
     """The newest usable checkpoint of a run, and why newer ones were skipped.
 
     Raises:
-      UselessCheckpointError: there is none, or all are damaged or too old.
+      UnusableCheckpointError: there is none, or all are damaged or too old.
       CheckpointError: it cannot be reached, is of a newer version, or belongs to another config.
     """
     checkpoint, skipped = newest_valid(folder.checkpoint_location())
@@ -81,7 +81,7 @@ def last_checkpoint(folder: RunFolder, config: RunConfig) -> Checkpoint | None:
     """
     try:
         return resume_point(folder, config)[0]
-    except UselessCheckpointError:
+    except UnusableCheckpointError:
         return None
 
 

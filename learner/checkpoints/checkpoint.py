@@ -18,14 +18,14 @@ from learner.checkpoints.manifest import (
     STATE,
     CheckpointError,
     Manifest,
-    UselessCheckpointError,
+    UnusableCheckpointError,
     damaged,
     decode_manifest,
     encode_manifest,
     parse_object,
 )
-from learner.checkpoints.retention import Scored, best_first, names_to_keep
-from learner.checkpoints.store import CheckpointStore, Sized, env_steps_of, open_store
+from learner.checkpoints.retention import Score, best_first, names_to_keep
+from learner.checkpoints.store import CheckpointStore, OpenFile, env_steps_of, open_store
 from learner.config import WHERE, RunConfig, flat_params, from_dict
 from sim_core.checks import ConfigError
 
@@ -55,15 +55,15 @@ class Checkpoint(NamedTuple):
     state: dict[str, Any]
 
 
-class Keep(NamedTuple):
+class Retention(NamedTuple):
     """Which checkpoints stay: the newest so many, and the best so many by the evaluations during training."""
 
     newest: int
     best: int
-    scores: list[Scored]
+    scores: list[Score]
 
 
-def complete_checkpoint(
+def commit_checkpoint(
     store: CheckpointStore, draft: Location, env_steps: int, state: dict[str, Any], files: dict[str, FileSum]
 ) -> Location:
     """Makes a draft with all parts written a checkpoint.
@@ -87,14 +87,14 @@ def complete_checkpoint(
     return store.location(store.complete(draft, {STATE: text, MANIFEST: manifest}))
 
 
-def keep_checkpoints(store: CheckpointStore, last: Location, keep: Keep) -> None:
+def prune_checkpoints(store: CheckpointStore, last: Location, retention: Retention) -> None:
     """Removes all checkpoints but those to keep, and what crashed writers left.
 
     What calls itself newer than `last`, the one just written, was skipped when the run was resumed: it goes too.
     """
     names = store.names()
     own = names[[store.location(name) for name in names].index(last) :]
-    kept = names_to_keep([(name, env_steps_of(name)) for name in own], keep.newest, keep.best, keep.scores)
+    kept = names_to_keep([(name, env_steps_of(name)) for name in own], retention.newest, retention.best, retention.scores)
     store.remove([name for name in names if name not in kept])
 
 
@@ -102,7 +102,7 @@ def read_checkpoint(store: CheckpointStore, name: str) -> Checkpoint:
     """Verifies every file of a checkpoint and reads its state.
 
     Raises:
-      UselessCheckpointError: it is incomplete, damaged, or of an older format.
+      UnusableCheckpointError: it is incomplete, damaged, or of an older format.
       CheckpointError: it is of a newer format.
     """
     location = store.location(name)
@@ -114,7 +114,7 @@ def read_checkpoint(store: CheckpointStore, name: str) -> Checkpoint:
     return Checkpoint(location, state)
 
 
-def _open(store: CheckpointStore, name: str, file: str) -> Sized:
+def _open(store: CheckpointStore, name: str, file: str) -> OpenFile:
     try:
         return store.open(name, file)
     except (OSError, ValueError) as error:
@@ -149,14 +149,14 @@ def newest_valid(root: Location) -> tuple[Checkpoint, list[str]]:
     """The newest checkpoint that passes, and why newer ones were skipped.
 
     Raises:
-      UselessCheckpointError: there is none, or all are damaged or too old.
+      UnusableCheckpointError: there is none, or all are damaged or too old.
       CheckpointError: the storage does not answer, or none passes and one is of a newer format.
     """
     store, names = _listed(root)
     return _first_valid(root, store, names)
 
 
-def best_valid(root: Location, scores: list[Scored]) -> tuple[Checkpoint, list[str]]:
+def best_valid(root: Location, scores: list[Score]) -> tuple[Checkpoint, list[str]]:
     """The checkpoint that did best in the evaluations during training and passes, and why better ones were skipped.
 
     Raises:
@@ -173,7 +173,7 @@ def valid_named(root: Location, name: str) -> Checkpoint:
     """The checkpoint of that name, as `finished_names` lists it.
 
     Raises:
-      UselessCheckpointError: it is damaged or too old.
+      UnusableCheckpointError: it is damaged or too old.
       CheckpointError: there is none of that name, it is of a newer format, or the storage does not answer.
     """
     store, names = _listed(root)
@@ -208,13 +208,13 @@ def _first_valid(root: Location, store: CheckpointStore, names: list[str]) -> tu
         except CheckpointError as error:
             skipped.append(error)
     reason = f": {skipped[0]}" if skipped else ""
-    useless = all(isinstance(error, UselessCheckpointError) for error in skipped)
-    kind = UselessCheckpointError if useless else CheckpointError
+    useless = all(isinstance(error, UnusableCheckpointError) for error in skipped)
+    kind = UnusableCheckpointError if useless else CheckpointError
     raise kind(f"no usable checkpoint in {root}{reason}")
 
 
 def check_state(checkpoint: Checkpoint) -> None:
-    """Raises UselessCheckpointError unless the state has all fields, of the right kinds and no number below 0."""
+    """Raises UnusableCheckpointError unless the state has all fields, of the right kinds and no number below 0."""
     for name, kind in KINDS.items():
         value = checkpoint.state.get(name)
         if type(value) is not kind or (isinstance(value, int) and value < 0):

@@ -27,7 +27,7 @@ class CheckpointError(ConfigError):
     """A checkpoint that cannot be used; the message says why."""
 
 
-class UselessCheckpointError(CheckpointError):
+class UnusableCheckpointError(CheckpointError):
     """None is there, or what is there is damaged or too old: this version can never use it."""
 
 
@@ -49,7 +49,7 @@ def decode_manifest(data: bytes, where: object) -> Manifest:
     """Reads a manifest; `where` names its checkpoint in messages.
 
     Raises:
-      UselessCheckpointError: it is damaged or of an older format.
+      UnusableCheckpointError: it is damaged or of an older format.
       CheckpointError: it is of a newer format.
     """
     text, newline, rest = data.partition(b"\n")
@@ -77,13 +77,13 @@ def _refuse_other_format(text: bytes, whole: bool, where: object) -> None:
         return
     message = f"checkpoint {where} is in format {found[0]!r}, this version reads {FORMAT!r}: "
     if int(found[1]) < VERSION:
-        raise UselessCheckpointError(message + "go on with the version of shoal that wrote it, or train anew")
+        raise UnusableCheckpointError(message + "go on with the version of shoal that wrote it, or train anew")
     raise CheckpointError(message + "go on with a newer version of shoal")
 
 
-def damaged(where: object, what: str) -> UselessCheckpointError:
+def damaged(where: object, what: str) -> UnusableCheckpointError:
     """The error for a checkpoint that is not what was written."""
-    return UselessCheckpointError(f"checkpoint {where} is damaged ({what}); use an older one or train anew")
+    return UnusableCheckpointError(f"checkpoint {where} is damaged ({what}); use an older one or train anew")
 
 
 def parse_object(text: bytes) -> dict[str, Any] | None:

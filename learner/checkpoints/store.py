@@ -22,7 +22,7 @@ OURS = re.compile(r"step-\d{12,18}(\.|$)")
 NAME = re.compile(r"step-(\d{12,18})(?:\.(\d{1,9}|old))?")
 
 
-class Sized(NamedTuple):
+class OpenFile(NamedTuple):
     """An open file and its length in bytes."""
 
     file: BinaryIO
@@ -40,7 +40,7 @@ class CheckpointStore(Protocol):
         """Where a checkpoint's files lie."""
         ...
 
-    def open(self, name: str, file: str) -> Sized:
+    def open(self, name: str, file: str) -> OpenFile:
         """Opens one file of a checkpoint; whatever is no plain file of its folder is refused with an OSError."""
         ...
 
@@ -100,7 +100,7 @@ class FolderStore:
         """The checkpoint's folder."""
         return self._root / name
 
-    def open(self, name: str, file: str) -> Sized:
+    def open(self, name: str, file: str) -> OpenFile:
         """Opens a file, unless it or a folder on the way to it is a link, or it is no regular file."""
         path = self._root
         for part in (name, *file.split("/")):
@@ -110,7 +110,7 @@ class FolderStore:
         if not stat.S_ISREG(path.stat().st_mode):
             raise OSError(f"{path} is no plain file")
         opened = path.open("rb")
-        return Sized(opened, os.fstat(opened.fileno()).st_size)
+        return OpenFile(opened, os.fstat(opened.fileno()).st_size)
 
     def draft(self, env_steps: int) -> Path:
         """The final name, something random and `.part`."""
@@ -169,11 +169,11 @@ class UrlStore:
         """The checkpoint's URL."""
         return f"{self._url}/{name}"
 
-    def open(self, name: str, file: str) -> Sized:
+    def open(self, name: str, file: str) -> OpenFile:
         """Opens a file."""
         with storage_errors(self._url):
             opened = self._files.open(f"{self._path}/{name}/{file}", "rb")
-            return Sized(opened, int(opened.size))
+            return OpenFile(opened, int(opened.size))
 
     def draft(self, env_steps: int) -> str:
         """The first name of these env steps that is not taken."""

@@ -15,7 +15,7 @@ from actors.service.fault_policy import CallFailed, Component, ComponentFailed, 
 from actors.service.rpc import Calls, Node
 from actors.storage.fragment_writer import FileSum, WriteResult, join_results
 from actors.storage.uri import Location
-from learner.checkpoints.checkpoint import Keep, complete_checkpoint, keep_checkpoints
+from learner.checkpoints.checkpoint import Retention, commit_checkpoint, prune_checkpoints
 from learner.checkpoints.store import open_store
 
 DEADLINE_S = 900.0
@@ -24,7 +24,7 @@ POLL_S = 0.05
 """Time between two questions to the nodes whether they have written."""
 
 
-class Moment(NamedTuple):
+class RunPosition(NamedTuple):
     """What a checkpoint is of: env steps and updates so far, and bytes of the journal that it covers."""
 
     env_steps: int
@@ -32,19 +32,19 @@ class Moment(NamedTuple):
     journal_offset: int
 
 
-class Ended(NamedTuple):
-    """How a checkpoint ended: its moment, and its location or else why it could not be written.
+class CheckpointResult(NamedTuple):
+    """How a checkpoint ended: its position, and its location or else why it could not be written.
 
     `failure` tells of the part of the run that failed meanwhile, if that is why.
     """
 
-    moment: Moment
+    position: RunPosition
     location: Location | None
     error: str | None
     failure: ComponentFailed | None = None
 
 
-class Writer(NamedTuple):
+class SavingComponent(NamedTuple):
     """A part of the run that has been told to save itself: which, of which incarnation, and its node with `saved`."""
 
     component: Component
@@ -56,11 +56,11 @@ class Writer(NamedTuple):
         return ComponentFailed(self.component, self.incarnation, failure.fault, f"saved: {failure.reason}")
 
 
-class GivenUp(Exception):
+class Abandoned(Exception):
     """Nobody waits for the checkpoint any more."""
 
 
-class Checkpointer:
+class CheckpointWriter:
     """Writes one checkpoint of a run at a time.
 
     Args:
@@ -74,8 +74,8 @@ class Checkpointer:
         self._calls = calls
         self._patience_s = patience_s
         self._thread: threading.Thread | None = None
-        self._ended: Ended | None = None
-        self._given_up = threading.Event()
+        self._ended: CheckpointResult | None = None
+        self._abandoned = threading.Event()
 
     @property
     def is_busy(self) -> bool:
@@ -87,12 +87,17 @@ class Checkpointer:
         return self._store.draft(env_steps)
 
     def begin(
-        self, moment: Moment, draft: Location, state: dict[str, Any], writers: list[Writer], seal: Callable[[], Keep]
+        self,
+        position: RunPosition,
+        draft: Location,
+        state: dict[str, Any],
+        writers: list[SavingComponent],
+        seal: Callable[[], Retention],
     ) -> None:
         """Goes on in the background, once every part has begun to save.
 
         Args:
-          moment: what the checkpoint is of.
+          position: what the checkpoint is of.
           draft: where the parts write.
           state: the rest of the state, for JSON; nobody changes it any more.
           writers: the parts.
@@ -102,17 +107,17 @@ class Checkpointer:
         def write() -> None:
             files = self._parts(writers)
             keep = seal()
-            location = complete_checkpoint(self._store, draft, moment.env_steps, state, files)
-            self._ended = Ended(moment, location, None)
-            keep_checkpoints(self._store, location, keep)
+            location = commit_checkpoint(self._store, draft, position.env_steps, state, files)
+            self._ended = CheckpointResult(position, location, None)
+            prune_checkpoints(self._store, location, keep)
 
-        self._start(moment, write)
+        self._start(position, write)
 
-    def drop(self, moment: Moment, writers: list[Writer], failure: ComponentFailed) -> None:
+    def abort(self, position: RunPosition, writers: list[SavingComponent], failure: ComponentFailed) -> None:
         """Waits in the background until `writers` are ready for another checkpoint: this one could not begin.
 
         Args:
-          moment: what the checkpoint would have been of.
+          position: what the checkpoint would have been of.
           writers: the parts that may have begun to save.
           failure: of a part that did not, which the caller mends.
         """
@@ -121,21 +126,23 @@ class Checkpointer:
             self._parts(writers)
             raise OSError(str(failure))
 
-        self._start(moment, write)
+        self._start(position, write)
 
-    def _start(self, moment: Moment, write: Callable[[], None]) -> None:
+    def _start(self, position: RunPosition, write: Callable[[], None]) -> None:
         assert self._thread is None
         self._ended = None
-        self._thread = threading.Thread(target=self._guard, args=(moment, write), name="shoal-checkpoint", daemon=True)
+        self._thread = threading.Thread(
+            target=self._guard, args=(position, write), name="shoal-checkpoint", daemon=True
+        )
         self._thread.start()
 
-    def _guard(self, moment: Moment, write: Callable[[], None]) -> None:
+    def _guard(self, position: RunPosition, write: Callable[[], None]) -> None:
         try:
             write()
         except Exception as error:  # a disk's, a storage client's, Ray's: each raises its own, and training goes on
             # a new one: references in the traceback must not outlive Ray
             failure = ComponentFailed(*error.args) if isinstance(error, ComponentFailed) else None
-            self._ended = self._ended or Ended(moment, None, first_line(error), failure)
+            self._ended = self._ended or CheckpointResult(position, None, first_line(error), failure)
             self._tidy()
 
     def _tidy(self) -> None:
@@ -144,7 +151,7 @@ class Checkpointer:
         except OSError:
             pass  # whatever kept the checkpoint from being written; the next one tidies up
 
-    def _parts(self, writers: list[Writer]) -> dict[str, FileSum]:
+    def _parts(self, writers: list[SavingComponent]) -> dict[str, FileSum]:
         """Waits until all parts have written, even if one has failed: the next checkpoint must find them ready."""
         deadline_s = time.monotonic() + DEADLINE_S
         waiting, written, failures = list(writers), [], []
@@ -162,25 +169,25 @@ class Checkpointer:
             if waiting and time.monotonic() > deadline_s:
                 late = ", ".join(sorted(str(writer.component) for writer in waiting))
                 raise TimeoutError(f"{late} did not write within {DEADLINE_S:.0f} s")
-            if waiting and self._given_up.wait(POLL_S):
-                raise GivenUp
+            if waiting and self._abandoned.wait(POLL_S):
+                raise Abandoned
         if failures:
             raise failures[0]
         return _files(written)
 
-    def _ask(self, writer: Writer) -> WriteResult | None:
+    def _ask(self, writer: SavingComponent) -> WriteResult | None:
         """How a part's write ended; None while it is being written.
 
         Raises:
           ComponentFailed: it does not answer.
-          GivenUp: the run does not go on like this.
+          Abandoned: the run does not go on like this.
         """
         late_s = time.monotonic() + self._patience_s
         try:
             ref = self._calls.start(writer.node, "saved")
             while not self._calls.wait([ref], POLL_S):
-                if self._given_up.is_set():
-                    raise GivenUp
+                if self._abandoned.is_set():
+                    raise Abandoned
                 if time.monotonic() > late_s:
                     raise CallFailed(Fault.LATE, f"silent for {self._patience_s:.0f} s")
             answer: WriteResult | None = self._calls.get(ref)
@@ -188,11 +195,11 @@ class Checkpointer:
             raise writer.failed(failure) from failure
         return answer
 
-    def poll(self) -> Ended | None:
+    def poll(self) -> CheckpointResult | None:
         """How the checkpoint under way ended, told once; None while it is being written, or there is none."""
         return None if self._thread is None or self._thread.is_alive() else self.wait()
 
-    def wait(self) -> Ended | None:
+    def wait(self) -> CheckpointResult | None:
         """Waits for the checkpoint under way and tells how it ended; None if there is none."""
         if self._thread is None:
             return None
@@ -200,9 +207,9 @@ class Checkpointer:
         self._thread = None
         return self._ended
 
-    def give_up(self) -> None:
+    def abandon(self) -> None:
         """Waits for no part any more: the run ends, or goes on with others. What writes does not outlive this call."""
-        self._given_up.set()
+        self._abandoned.set()
         self.wait()
 
 

@@ -6,9 +6,9 @@ from typing import Any, Protocol
 
 from actors.service.fault_policy import Component, ComponentFailed, ComponentKind
 from actors.storage.uri import Location, join_location
-from learner.checkpoints.checkpoint import Checkpoint, Keep
-from learner.checkpoints.retention import Scored, scores_of
-from learner.checkpoints.writer import Checkpointer, Ended, Moment, Writer
+from learner.checkpoints.checkpoint import Checkpoint, Retention
+from learner.checkpoints.retention import Score, scores_of
+from learner.checkpoints.writer import CheckpointResult, CheckpointWriter, RunPosition, SavingComponent
 from learner.config import RunConfig, to_dict
 from learner.tracking.journal import Journal
 from learner.training.counters import Progress
@@ -46,7 +46,7 @@ class Saver:
         self,
         config: RunConfig,
         keep_best: int,
-        checkpointer: Checkpointer,
+        checkpointer: CheckpointWriter,
         mender: Mender,
         progress: Progress,
         journal: Journal,
@@ -59,7 +59,7 @@ class Saver:
         self._progress = progress
         self._journal = journal
         self._observer = observer
-        self._scores: list[Scored] = []
+        self._scores: list[Score] = []
         self._scored_to = 0
         """Rows before this byte of the journal have been looked through for scores: hours of them are long."""
         self._saved: Location | None = None
@@ -83,14 +83,16 @@ class Saver:
         Raises:
           ComponentFailed: a part could not begin; the checkpoint stays wanted.
         """
-        moment = Moment(self._progress.env_steps, self._progress.updates, self._journal.length)
+        moment = RunPosition(self._progress.env_steps, self._progress.updates, self._journal.length)
         draft = self._checkpointer.draft(moment.env_steps)
-        writers = [Writer(part, self._mender.incarnation(part), self._mender.node(part)) for part in self._parts()]
+        writers = [
+            SavingComponent(part, self._mender.incarnation(part), self._mender.node(part)) for part in self._parts()
+        ]
         try:
             state = self._state(draft, moment)
         except ComponentFailed as failure:
             self.is_wanted = True
-            self._checkpointer.drop(
+            self._checkpointer.abort(
                 moment, [writer for writer in writers if writer.component != failure.component], failure
             )
             raise
@@ -100,7 +102,7 @@ class Saver:
     def _parts(self) -> list[Component]:
         return [LEARNER, *self._mender.workers]
 
-    def _state(self, draft: Location, moment: Moment) -> dict[str, Any]:
+    def _state(self, draft: Location, moment: RunPosition) -> dict[str, Any]:
         """Tells all parts to save themselves to `draft`; the rest of the run's state, for JSON."""
         places = {worker: (_worker_file(draft, worker),) for worker in self._mender.workers}
         learner, *workers = self._mender.ask_all("save", {LEARNER: (draft,)} | places)
@@ -112,12 +114,12 @@ class Saver:
             "workers": workers,
         }
 
-    def _seal(self, moment: Moment) -> Keep:
+    def _seal(self, moment: RunPosition) -> Retention:
         """Makes the journal durable before a checkpoint counts on it; tells which checkpoints stay."""
         self._journal.sync()
         self._scores += scores_of(self._journal.rows(self._scored_to, moment.journal_offset))
         self._scored_to = moment.journal_offset
-        return Keep(self._config.keep_checkpoints, self._keep_best, list(self._scores))
+        return Retention(self._config.keep_checkpoints, self._keep_best, list(self._scores))
 
     def poll(self) -> ComponentFailed | None:
         """Tells of a checkpoint that has ended; a part that failed meanwhile is the caller's to mend."""
@@ -128,13 +130,13 @@ class Saver:
         return self._take(self._checkpointer.wait())
 
     def give_up(self) -> None:
-        """Ends what is being written (see `Checkpointer.give_up`)."""
-        self._checkpointer.give_up()
+        """Ends what is being written (see `CheckpointWriter.abandon`)."""
+        self._checkpointer.abandon()
 
-    def _take(self, ended: Ended | None) -> ComponentFailed | None:
+    def _take(self, ended: CheckpointResult | None) -> ComponentFailed | None:
         if ended is None:
             return None
-        moment = ended.moment
+        moment = ended.position
         if ended.location is None:
             self._observer.checkpoint_failed(moment.env_steps, ended.error or "")
             self.is_wanted |= ended.failure is not None  # else the storage failed: not before the next one is due

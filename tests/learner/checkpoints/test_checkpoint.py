@@ -11,16 +11,16 @@ import pytest
 from actors.storage.fragment_writer import FragmentWriter, file_sum, join_results
 from actors.storage.uri import join_location
 from learner.checkpoints.checkpoint import (
-    Keep,
+    Retention,
     best_valid,
-    complete_checkpoint,
-    keep_checkpoints,
+    commit_checkpoint,
     newest_valid,
+    prune_checkpoints,
     read_checkpoint,
     valid_named,
 )
-from learner.checkpoints.manifest import CheckpointError, UselessCheckpointError, encode_manifest
-from learner.checkpoints.retention import Scored
+from learner.checkpoints.manifest import CheckpointError, UnusableCheckpointError, encode_manifest
+from learner.checkpoints.retention import Score
 from learner.checkpoints.store import open_store
 
 STATE = {"seed": 0, "nested": {"numbers": [1, 2.5, 2**70]}}
@@ -49,7 +49,7 @@ def save_parts(draft, seed=0):
 def write(root, env_steps, seed=0):
     store = open_store(root)
     draft = store.draft(env_steps)
-    return complete_checkpoint(store, draft, env_steps, {**STATE, "seed": seed}, save_parts(draft, seed))
+    return commit_checkpoint(store, draft, env_steps, {**STATE, "seed": seed}, save_parts(draft, seed))
 
 
 def read(location):
@@ -58,7 +58,7 @@ def read(location):
 
 def keep(root, newest, best=0, scores=()):
     store = open_store(root)
-    keep_checkpoints(store, store.location(store.names()[0]), Keep(newest, best, list(scores)))
+    prune_checkpoints(store, store.location(store.names()[0]), Retention(newest, best, list(scores)))
 
 
 def files_of(folder):
@@ -168,7 +168,7 @@ def test_a_flipped_bit_in_the_manifest_is_noticed(folder):
         damaged = bytearray(whole)
         damaged[place] ^= 1 << place % 8
         path.write_bytes(damaged)
-        with pytest.raises(UselessCheckpointError):
+        with pytest.raises(UnusableCheckpointError):
             read(folder)
 
 
@@ -242,7 +242,7 @@ def test_the_newest_are_kept(tmp_path):
 
 def test_the_best_are_kept_too_and_found_again(tmp_path):
     folders = {env_steps: write(tmp_path, env_steps) for env_steps in (10, 20, 30, 40)}
-    scores = [Scored(10, 0.5), Scored(20, 0.9), Scored(30, 0.7), Scored(40, 0.1)]
+    scores = [Score(10, 0.5), Score(20, 0.9), Score(30, 0.7), Score(40, 0.1)]
     keep(tmp_path, 1, 1, scores)
     assert {path.name for path in tmp_path.iterdir()} == {folders[20].name, folders[40].name}
     assert best_valid(tmp_path, scores)[0].folder == folders[20]
@@ -261,13 +261,13 @@ def test_what_was_skipped_on_resume_goes_and_does_not_push_out_what_is_good(tmp_
     (bad / "a.bin").unlink()
     new = write(tmp_path, 20)  # by a run that went on from 10
     store = open_store(tmp_path)
-    keep_checkpoints(store, new, Keep(1, 0, []))
+    prune_checkpoints(store, new, Retention(1, 0, []))
     assert newest_valid(tmp_path)[0].folder == new
     assert not good.exists() and not bad.exists()
 
 
 @pytest.mark.parametrize(
-    ("found", "kind"), [(1, UselessCheckpointError), (3, UselessCheckpointError), (6, CheckpointError)]
+    ("found", "kind"), [(1, UnusableCheckpointError), (3, UnusableCheckpointError), (6, CheckpointError)]
 )
 def test_another_format_is_refused_by_name(folder, found, kind):
     """Up to version 3 the manifest was one JSON object without a checksum of its own."""
@@ -284,7 +284,7 @@ def test_a_state_that_is_no_object_is_refused(tmp_path, content):
     store = open_store(tmp_path)
     draft = store.draft(5)
     files = save_parts(draft)
-    location = complete_checkpoint(store, draft, 5, {}, files)
+    location = commit_checkpoint(store, draft, 5, {}, files)
     (location / "state.json").write_bytes(content)
     manifest = encode_manifest(5, {**files, "state.json": file_sum(location / "state.json")})
     (location / "manifest.json").write_bytes(manifest)

@@ -11,7 +11,7 @@ from actors.storage.fragment_writer import FileSum
 from learner.checkpoints.manifest import (
     CheckpointError,
     Manifest,
-    UselessCheckpointError,
+    UnusableCheckpointError,
     decode_manifest,
     encode_manifest,
 )
@@ -52,7 +52,7 @@ def test_round_trip(env_steps, files, own):
     ],
 )
 def test_a_name_that_leads_elsewhere_is_refused(name):
-    with pytest.raises(UselessCheckpointError, match="no file of a checkpoint"):
+    with pytest.raises(UnusableCheckpointError, match="no file of a checkpoint"):
         decode_manifest(encode_manifest(1, {"state.json": SUM, name: SUM}), "x")
 
 
@@ -62,7 +62,7 @@ def test_a_name_that_leads_elsewhere_is_refused(name):
 )
 def test_a_sum_that_is_none_is_refused(found):
     values = {"format": "shoal-checkpoint-5", "env_steps": 1, "files": {"state.json": [3, "0" * 64], "a": found}}
-    with pytest.raises(UselessCheckpointError, match="no length and SHA-256"):
+    with pytest.raises(UnusableCheckpointError, match="no length and SHA-256"):
         decode_manifest(signed(values), "x")
 
 
@@ -70,7 +70,7 @@ def test_a_sum_that_is_none_is_refused(found):
 @pytest.mark.parametrize("env_steps", [1, -1, "1", None, True, 1.5])
 def test_other_types_are_refused(files, env_steps):
     values = {"format": "shoal-checkpoint-5", "env_steps": env_steps, "files": files}
-    with pytest.raises(UselessCheckpointError, match="other content than a manifest"):
+    with pytest.raises(UnusableCheckpointError, match="other content than a manifest"):
         decode_manifest(signed(values), "x")
 
 
@@ -88,12 +88,12 @@ def test_any_signed_json_is_refused(values):
 
 def test_json_without_end_is_refused():
     text = b"[" * 200_000
-    with pytest.raises(UselessCheckpointError):
+    with pytest.raises(UnusableCheckpointError):
         decode_manifest(text + b"\n" + hashlib.sha256(text).hexdigest().encode() + b"\n", "x")
 
 
 @pytest.mark.parametrize(
-    ("version", "kind"), [(1, UselessCheckpointError), (4, UselessCheckpointError), (6, CheckpointError)]
+    ("version", "kind"), [(1, UnusableCheckpointError), (4, UnusableCheckpointError), (6, CheckpointError)]
 )
 def test_another_version_is_refused_by_name(version, kind):
     with pytest.raises(CheckpointError, match=f"shoal-checkpoint-{version}.*shoal-checkpoint-5") as caught:

@@ -2,10 +2,10 @@
 
 import pytest
 
-from learner.checkpoints.retention import Scored, best_first, names_to_keep, score_at, scores_of
+from learner.checkpoints.retention import Score, best_first, names_to_keep, score_at, scores_of
 from learner.tracking.journal import Row
 
-SCORES = [Scored(100, 0.2), Scored(200, 0.8), Scored(300, 0.8), Scored(400, 0.1)]
+SCORES = [Score(100, 0.2), Score(200, 0.8), Score(300, 0.8), Score(400, 0.1)]
 CHECKPOINTS = [(f"at {env_steps}", env_steps) for env_steps in (450, 350, 250, 200, 99)]
 
 
@@ -23,7 +23,7 @@ def test_evaluations_are_found_among_rows():
         Row(10, 0, {"eval/success_rate": 0.25, "eval/return": 3.0}),
         Row(20, 0, {"eval/return": -3.0}),
     ]
-    assert scores_of(rows) == [Scored(10, 0.25), Scored(20, -3.0)]
+    assert scores_of(rows) == [Score(10, 0.25), Score(20, -3.0)]
 
 
 def test_the_best_comes_first_of_two_alike_the_newer():

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from learner.checkpoints.checkpoint import KINDS, Checkpoint, check_config, check_state
-from learner.checkpoints.manifest import CheckpointError, UselessCheckpointError
+from learner.checkpoints.manifest import CheckpointError, UnusableCheckpointError
 from learner.config import to_dict
 
 WHERE = Path("runs/r/config.json")
@@ -29,10 +29,10 @@ def test_a_state_of_the_right_kinds_passes(checkpoint, small_run):
 def test_another_kind_is_refused(checkpoint, name, value):
     checkpoint.state[name] = value
     if type(value) is not KINDS[name] or value == -1:
-        with pytest.raises(UselessCheckpointError, match=name):
+        with pytest.raises(UnusableCheckpointError, match=name):
             check_state(checkpoint)
     del checkpoint.state[name]
-    with pytest.raises(UselessCheckpointError, match=name):
+    with pytest.raises(UnusableCheckpointError, match=name):
         check_state(checkpoint)
 
 

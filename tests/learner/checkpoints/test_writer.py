@@ -11,10 +11,10 @@ from actors.service.fault_policy import CallFailed, Component, ComponentFailed, 
 from actors.service.rpc import LocalCalls
 from actors.storage.fragment_writer import FragmentWriter
 from actors.storage.uri import check_writable, fetched, join_location, parse_location
-from learner.checkpoints.checkpoint import Keep, newest_valid
-from learner.checkpoints.manifest import CheckpointError, UselessCheckpointError
-from learner.checkpoints.retention import Scored
-from learner.checkpoints.writer import Checkpointer, Moment, Writer
+from learner.checkpoints.checkpoint import Retention, newest_valid
+from learner.checkpoints.manifest import CheckpointError, UnusableCheckpointError
+from learner.checkpoints.retention import Score
+from learner.checkpoints.writer import CheckpointWriter, RunPosition, SavingComponent
 from sim_core.checks import ConfigError
 
 
@@ -52,8 +52,8 @@ class Run:
         self.root = root
         self.nodes = {name: Node(name) for name in ("learner", "worker")}
         parts = (Component(ComponentKind.LEARNER), Component(ComponentKind.WORKER, 3))
-        self.writers = [Writer(part, 7, node) for part, node in zip(parts, self.nodes.values(), strict=True)]
-        self.checkpointer = Checkpointer(root, LocalCalls(), 60.0)
+        self.writers = [SavingComponent(part, 7, node) for part, node in zip(parts, self.nodes.values(), strict=True)]
+        self.checkpointer = CheckpointWriter(root, LocalCalls(), 60.0)
         self.scores = []
 
     def save(self, env_steps, updates=0):
@@ -65,8 +65,10 @@ class Run:
     def begin(self, env_steps, updates=0, newest=2, best=0):
         draft = self.save(env_steps, updates)
         state = {"env_steps": env_steps, "updates": updates}
-        keep = Keep(newest, best, self.scores)
-        self.checkpointer.begin(Moment(env_steps, updates, 7 * env_steps), draft, state, self.writers, lambda: keep)
+        keep = Retention(newest, best, self.scores)
+        self.checkpointer.begin(
+            RunPosition(env_steps, updates, 7 * env_steps), draft, state, self.writers, lambda: keep
+        )
 
     def write(self, *args, **kwargs):
         self.begin(*args, **kwargs)
@@ -96,7 +98,7 @@ def run(request, tmp_path):
 
 def test_what_was_written_is_read_back(run):
     ended = run.write(100, 5)
-    assert ended.error is None and ended.moment == Moment(100, 5, 700)
+    assert ended.error is None and ended.position == RunPosition(100, 5, 700)
     found, skipped = newest_valid(run.root)
     assert found.folder == ended.location and not skipped
     assert found.state == {"env_steps": 100, "updates": 5}
@@ -111,7 +113,7 @@ def test_training_goes_on_while_a_checkpoint_is_written(run):
     slow.go.clear()
     run.begin(100)
     assert run.checkpointer.is_busy and run.checkpointer.poll() is None
-    with pytest.raises(UselessCheckpointError):
+    with pytest.raises(UnusableCheckpointError):
         newest_valid(run.root)
     slow.go.set()
     assert run.checkpointer.wait().error is None
@@ -120,7 +122,7 @@ def test_training_goes_on_while_a_checkpoint_is_written(run):
 
 
 def test_the_newest_and_the_best_are_kept(run):
-    run.scores = [Scored(100, 0.9), Scored(200, 0.2), Scored(300, 0.4)]
+    run.scores = [Score(100, 0.9), Score(200, 0.2), Score(300, 0.4)]
     for env_steps in (100, 200, 300, 400):
         assert run.write(env_steps, newest=2, best=1).error is None
     assert run.steps() == [100, 300, 400]
@@ -182,7 +184,7 @@ def test_a_checkpoint_that_could_not_begin_waits_for_those_who_had_begun(run):
     slow.go.clear()
     run.save(100)
     failure = ComponentFailed(run.writers[1].component, 7, Fault.DIED, "simulated")
-    run.checkpointer.drop(Moment(100, 0, 700), run.writers[:1], failure)
+    run.checkpointer.abort(RunPosition(100, 0, 700), run.writers[:1], failure)
     assert run.checkpointer.is_busy and run.checkpointer.poll() is None
     slow.go.set()
     ended = run.checkpointer.wait()
@@ -197,7 +199,7 @@ def test_a_part_that_does_not_answer_is_late(tmp_path):
             return []
 
     run = Run(tmp_path / "checkpoints")
-    run.checkpointer = Checkpointer(run.root, Silent(), 0.1)
+    run.checkpointer = CheckpointWriter(run.root, Silent(), 0.1)
     ended = run.write(100)
     assert ended.failure.fault is Fault.LATE and "silent for 0 s" in ended.error
 
@@ -206,9 +208,9 @@ def test_what_is_given_up_ends_at_once_and_is_no_checkpoint(run):
     stuck = run.nodes["worker"]
     stuck.go.clear()
     run.begin(100)
-    run.checkpointer.give_up()
+    run.checkpointer.abandon()
     assert not run.checkpointer.is_busy
-    with pytest.raises(UselessCheckpointError):
+    with pytest.raises(UnusableCheckpointError):
         newest_valid(run.root)
     stuck.go.set()
 
@@ -248,7 +250,7 @@ def test_a_damaged_one_is_skipped_and_said(run):
     assert found.state["env_steps"] == 100
     assert len(skipped) == 1 and "step-000000000200" in skipped[0] and "learner/rows" in skipped[0]
     run.write_over("step-000000000100/manifest.json", json.dumps({}).encode())
-    with pytest.raises(UselessCheckpointError, match="no usable checkpoint"):
+    with pytest.raises(UnusableCheckpointError, match="no usable checkpoint"):
         newest_valid(run.root)
 
 

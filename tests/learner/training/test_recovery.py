@@ -12,7 +12,7 @@ from actors.rollout import node as rollout_node
 from actors.rollout.node import RolloutNode
 from actors.service.fault_policy import Action, ComponentKind, Fault, FaultTracker, RunFailed
 from learner.checkpoints.checkpoint import newest_valid
-from learner.checkpoints.writer import Checkpointer
+from learner.checkpoints.writer import CheckpointWriter
 from learner.loop import TrainingLoop
 from learner.tracking.journal import Journal
 from learner.training import cluster as cluster_module
@@ -67,7 +67,7 @@ def run(monkeypatch, tmp_path):
 
     Unless it is `free_running`, training waits for its checkpoints, so that every run is like the last one.
     """
-    start = Checkpointer._start
+    start = CheckpointWriter._start
 
     def start_and_wait(checkpointer, *args):
         start(checkpointer, *args)
@@ -75,7 +75,7 @@ def run(monkeypatch, tmp_path):
 
     def train(config, fault, seed=0, free_running=False):
         if not free_running:
-            monkeypatch.setattr(Checkpointer, "_start", start_and_wait)
+            monkeypatch.setattr(CheckpointWriter, "_start", start_and_wait)
         calls = FailingCalls(fault, seed)
         monkeypatch.setattr(cluster_module, "LocalCalls", lambda: calls)
         cluster = process_cluster(config, 0)._replace(collects_in_flight=2, blocks_in_flight=2 * config.workers)
