@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from actors.storage.atomic_write import replacing_file
 from actors.storage.uri import Location, parse_location
 from learner import file_names
 from learner.config import RunConfig, from_dict, to_dict, user_files
@@ -146,12 +146,8 @@ def find_run(name: str, runs_dir: Path) -> RunFolder:
 def write_json(path: Path, values: dict[str, Any]) -> None:
     """Writes a JSON file; an older one is replaced once the new is whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    with part.open("w") as file:
-        json.dump(values, file, indent=2)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
+    with replacing_file(path, sync_first=True) as partial:
+        partial.write_text(json.dumps(values, indent=2))
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -94,7 +94,9 @@ def prune_checkpoints(store: CheckpointStore, last: Location, retention: Retenti
     """
     names = store.names()
     own = names[[store.location(name) for name in names].index(last) :]
-    kept = names_to_keep([(name, env_steps_of(name)) for name in own], retention.newest, retention.best, retention.scores)
+    kept = names_to_keep(
+        [(name, env_steps_of(name)) for name in own], retention.newest, retention.best, retention.scores
+    )
     store.remove([name for name in names if name not in kept])
 
 

@@ -13,7 +13,7 @@ import uuid
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Protocol
 
-from actors.storage.fragment_writer import sync
+from actors.storage.atomic_write import replace_folder, sync
 from actors.storage.uri import Location, filesystem, storage_errors
 from learner.checkpoints.manifest import MANIFEST
 
@@ -124,13 +124,7 @@ class FolderStore:
             sync(draft / name)
         sync(draft)
         final = self._root / draft.name.split(".")[0]
-        old = final.with_name(final.name + ".old")
-        if final.exists():
-            shutil.rmtree(old, ignore_errors=True)
-            final.rename(old)  # after a crash between here and the next line it still counts
-        draft.rename(final)
-        sync(self._root)
-        shutil.rmtree(old, ignore_errors=True)
+        replace_folder(draft, final)  # `names` counts a `.old` that a crash leaves
         return final.name
 
     def remove(self, names: list[str]) -> None:

@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
+from actors.storage.atomic_write import replacing_file
 from sim_core.checks import ConfigError
 
 ACCOUNT = "account/"
@@ -149,6 +150,5 @@ class PushedMark:
 
     def write(self, offset: int) -> None:
         """Notes a byte."""
-        part = self._path.with_suffix(".part")
-        part.write_text(str(offset))
-        part.replace(self._path)
+        with replacing_file(self._path) as partial:
+            partial.write_text(str(offset))
