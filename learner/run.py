@@ -20,10 +20,10 @@ from learner.placement import Place
 from learner.ray_backend.cluster import ray_cluster
 from learner.ray_backend.metrics import RayMetrics
 from learner.run_folder import RunFolder
-from learner.tracking.delivery import Delivery, insist
+from learner.tracking.delivery import Delivery, retry
 from learner.tracking.fault_log import FaultLog
 from learner.tracking.journal import Journal, PushedMark, Row
-from learner.tracking.mlflow_run import TROUBLE, Tracker
+from learner.tracking.mlflow_run import MLFLOW_ERRORS, Tracker
 from learner.tracking.observer import Display, MirroringObserver
 from learner.tracking.redaction import hide_secrets
 from learner.training.cluster import Cluster, process_cluster
@@ -115,11 +115,11 @@ def execute(
     try:
         result, rows = _train(folder, config, tracker, display, checkpoint, place)
         if result.evaluation is not None:
-            patience_s = tracker.patience_s
+            patience_s = tracker.retry_timeout_s
             time_ms = _time_of_results(result, rows, tracker)
             metrics = as_metrics(result.evaluation)
-            insist(lambda: tracker.final(metrics, time_ms), "the results", patience_s, say)
-            insist(lambda: finish(result, rows), "the artifacts", patience_s, say)
+            retry(lambda: tracker.log_results(metrics, time_ms), "the results", patience_s, say)
+            retry(lambda: finish(result, rows), "the artifacts", patience_s, say)
         status = "FINISHED" if result.stopped_by is None else "KILLED"
         return result
     except KeyboardInterrupt:
@@ -142,10 +142,10 @@ def _time_of_results(result: RunResult, rows: list[Row], tracker: Tracker) -> in
 
 def _end(tracker: Tracker, status: str, say: Callable[[str], None]) -> None:
     """Closes the MLflow run; one that cannot be closed is so by the next sitting."""
-    patience_s = tracker.patience_s if status == "FINISHED" else 0.0
+    patience_s = tracker.retry_timeout_s if status == "FINISHED" else 0.0
     try:
-        insist(lambda: tracker.end(status), f"that the run is {status}", patience_s, say)
-    except TROUBLE as error:
+        retry(lambda: tracker.end(status), f"that the run is {status}", patience_s, say)
+    except MLFLOW_ERRORS as error:
         say(f"MLflow does not know that the run is {status}: {first_line(error)}")
 
 
@@ -188,7 +188,7 @@ def _train(
 
 
 def _deliver_rest(delivery: Delivery, tracker: Tracker, result: RunResult, say: Callable[[str], None]) -> None:
-    left = delivery.flush(LAST_FLUSH_S if result.stopped_by is not None else max(LAST_FLUSH_S, tracker.patience_s))
+    left = delivery.flush(LAST_FLUSH_S if result.stopped_by is not None else max(LAST_FLUSH_S, tracker.retry_timeout_s))
     if left is not None:
         say(f"MLflow lacks the newest metrics, which `shoal resume` sends again: {left}")
 

@@ -152,14 +152,14 @@ def _train(
 ) -> None:
     """Trains from a checkpoint or the start, and evaluates the policy."""
     if checkpoint is None:
-        tracker.skip_what_is_logged()  # the same cell makes the same rows again, at another time
+        tracker.skip_logged_metrics()  # the same cell makes the same rows again, at another time
 
     def finish(result: RunResult, rows: list[Row]) -> None:
         assert result.weights is not None and result.episodes is not None and result.evaluation is not None
         shape = env_shape(cell.config.env)
         save_policy(folder.policy, result.weights, cell.config, shape)
         results = _evaluate_all(sweep, cell, folder, result.weights, result.episodes)
-        tracker.artifact(folder.policy)
+        tracker.log_artifact(folder.policy)
         tracker.log_policy(result.weights, cell.config, shape, score(result.evaluation))
         _log_table(results, folder, tracker)
 
@@ -181,7 +181,7 @@ def _play_again(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Trac
 def _play_baseline(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker) -> None:
     """Plays a baseline's episodes, of which there is nothing to resume."""
     stats = evaluate(cell.config.env, Baseline(cell.policy), _fixed_seeds(cell))
-    tracker.final(as_metrics(summarise(stats)), tracker.started_ms)
+    tracker.log_results(as_metrics(summarise(stats)), tracker.started_ms)
     _log_table([_stored(sweep, cell, cell.config, stats, folder, 0)], folder, tracker)
 
 
@@ -189,7 +189,7 @@ def _log_table(results: list[ResultRow], folder: RunFolder, tracker: Tracker) ->
     """Writes and logs the table of a cell's results, which does not count yet."""
     table = _new_table(folder)
     write_table(table, results)
-    tracker.artifact(table)
+    tracker.log_artifact(table)
 
 
 def _new_table(folder: RunFolder) -> Path:

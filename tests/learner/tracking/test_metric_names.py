@@ -1,4 +1,8 @@
+<<<<<<< HEAD
 """The table of metrics: complete, valid names for Prometheus, and the same in learner/README.md."""
+=======
+"""The table of metrics: complete, valid in Prometheus, and the same on the operator's page."""
+>>>>>>> b2bb49a (Tracking: plain sentences and standard names)
 
 import re
 from contextlib import closing
@@ -18,7 +22,7 @@ README = Path(__file__).parents[3] / "learner" / "README.md"
 
 
 def journal_names(config: RunConfig, folder: Path) -> set[str]:
-    """Names of all metrics that a run in one process leaves in its journal."""
+    """Names of all metrics in the journal of a run in one process."""
     with closing(Journal(folder / "metrics.jsonl", 0)) as journal:
         loop = TrainingLoop(config, process_cluster(config, 0), journal, folder / "checkpoints", Silent(), bool)
         assert loop.run()
@@ -27,7 +31,7 @@ def journal_names(config: RunConfig, folder: Path) -> set[str]:
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory, small_run):
-    """What runs of our environment and of one without outcomes measure together."""
+    """Names from a run of our environment and a run of one without outcomes."""
     plain = dict(
         engine="process",
         total_env_steps=2_000,
@@ -44,11 +48,11 @@ def written(tmp_path_factory, small_run):
     return journal_names(ours, tmp_path_factory.mktemp("ours")) | journal_names(other, tmp_path_factory.mktemp("other"))
 
 
-def test_the_table_has_every_metric_of_the_journal_and_no_other(written):
+def test_the_table_lists_exactly_the_metrics_of_the_journal(written):
     assert {known.journal for known in METRICS} - {ENV_STEPS} == written
 
 
-def test_names_are_prometheus_names_and_stand_once():
+def test_names_are_valid_in_prometheus_and_unique():
     for of in ("journal", "name", "series"):
         assert len({getattr(known, of) for known in METRICS}) == len(METRICS)
     for known in METRICS:
