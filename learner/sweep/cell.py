@@ -26,7 +26,7 @@ from learner.config import RunConfig
 from learner.export.policy_file import read_saved_policy, save_policy
 from learner.file_names import EVALUATIONS
 from learner.placement import Place
-from learner.run import RunResult, execute, last_checkpoint
+from learner.run import RunResult, RunSession, last_checkpoint
 from learner.run_folder import RunFolder, RunIdentity
 from learner.sweep.grid import Cell, SweepConfig, cell_hash, done_cells, other_worlds
 from learner.tracking.journal import Row
@@ -163,7 +163,7 @@ def _train(
         tracker.log_policy(result.weights, cell.config, shape, score(result.evaluation))
         _log_table(results, folder, tracker)
 
-    execute(folder, cell.config, tracker, RowDisplay(on_row), checkpoint, Place(), finish)
+    RunSession(folder, cell.config, tracker, RowDisplay(on_row), Place()).execute(checkpoint, finish)
 
 
 def _fixed_seeds(cell: Cell) -> list[int]:

@@ -43,7 +43,7 @@ class Delivery:
         self._thread = threading.Thread(target=self._work, name="mlflow-delivery", daemon=True)
         self._thread.start()
 
-    def up_to(self, offset: int) -> None:
+    def deliver_up_to(self, offset: int) -> None:
         """Requests the delivery of the rows before byte `offset`; returns at once."""
         with self._changed:
             self._requested = max(self._requested, offset)

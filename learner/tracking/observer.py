@@ -61,7 +61,7 @@ class MirroringObserver:
 
     def checkpoint(self, folder: Location, journal_offset: int) -> None:
         """Requests the delivery of the rows that the checkpoint covers."""
-        self._delivery.up_to(journal_offset)
+        self._delivery.deliver_up_to(journal_offset)
 
     def checkpoint_failed(self, env_steps: int, reason: str) -> None:
         """Shows the reason; the next checkpoint is tried when it is due."""

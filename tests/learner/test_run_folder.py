@@ -77,10 +77,10 @@ def test_an_unknown_run_is_refused_with_those_there_are(tmp_path, small_run):
 
 def test_a_run_is_held_by_one_process_at_a_time(tmp_path):
     path = tmp_path / "one"
-    other = "import sys, pathlib, learner.run_folder as r\nwith r.RunFolder(pathlib.Path(sys.argv[1])).hold(): pass"
-    with RunFolder(path).hold():
+    other = "import sys, pathlib, learner.run_folder as r\nwith r.RunFolder(pathlib.Path(sys.argv[1])).lock(): pass"
+    with RunFolder(path).lock():
         with pytest.raises(ConfigError, match="another process is training .*one"):
-            RunFolder(path).hold().__enter__()
+            RunFolder(path).lock().__enter__()
         done = subprocess.run([sys.executable, "-c", other, str(path)], capture_output=True, text=True, check=False)
         assert done.returncode != 0 and "another process is training" in done.stderr
     done = subprocess.run([sys.executable, "-c", other, str(path)], capture_output=True, text=True, check=False)

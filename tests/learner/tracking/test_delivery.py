@@ -71,10 +71,10 @@ def write(journal, rows):
 def test_rows_are_delivered_once_a_checkpoint_covers_them(delivery, server, journal, mark):
     offset = write(journal, ROWS[:3])
     write(journal, ROWS[3:5])  # not covered by a checkpoint yet
-    delivery.up_to(offset)
+    delivery.deliver_up_to(offset)
     assert delivery.flush(30) is None
     assert server.rows == ROWS[:3] and mark.read() == offset
-    delivery.up_to(journal.sync())
+    delivery.deliver_up_to(journal.sync())
     assert delivery.flush(30) is None
     assert server.rows == ROWS[:5]
 
@@ -82,7 +82,7 @@ def test_rows_are_delivered_once_a_checkpoint_covers_them(delivery, server, jour
 def test_rows_of_an_outage_are_delivered_after_it_in_order_and_once(delivery, server, journal, said):
     server.up = False
     for i in range(0, 12, 3):
-        delivery.up_to(write(journal, ROWS[i : i + 3]))
+        delivery.deliver_up_to(write(journal, ROWS[i : i + 3]))
     assert delivery.flush(0.2) == "connection refused"
     assert server.rows == [] and server.calls >= 2
     server.up = True
@@ -94,7 +94,7 @@ def test_rows_of_an_outage_are_delivered_after_it_in_order_and_once(delivery, se
 def test_a_request_does_not_wait_for_a_server_that_hangs(delivery, server, journal):
     server.busy.clear()
     for row in ROWS:
-        delivery.up_to(write(journal, [row]))  # returns, or the test times out
+        delivery.deliver_up_to(write(journal, [row]))  # returns, or the test times out
     server.busy.set()
     assert delivery.flush(30) is None
     assert server.rows == ROWS
@@ -104,7 +104,7 @@ def test_rows_of_a_request_in_flight_at_the_close_do_not_count(server, journal, 
     monkeypatch.setattr(delivery_module, "CLOSE_TIMEOUT_S", 0.01)
     delivery = Delivery(server, journal, mark, said.append)
     server.busy.clear()
-    delivery.up_to(write(journal, ROWS[:2]))
+    delivery.deliver_up_to(write(journal, ROWS[:2]))
     while not server.calls:
         threading.Event().wait(0.01)
     delivery.close()
@@ -112,7 +112,7 @@ def test_rows_of_a_request_in_flight_at_the_close_do_not_count(server, journal, 
     delivery._thread.join(30)
     assert mark.read() == 0
     with closing(Delivery(server, journal, mark, said.append)) as successor:
-        successor.up_to(journal.sync())
+        successor.deliver_up_to(journal.sync())
         assert successor.flush(30) is None
     assert server.rows == ROWS[:2] * 2  # the same rows with the same times, which MLflow stores once
 
