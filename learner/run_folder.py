@@ -104,7 +104,7 @@ class RunFolder:
             raise ConfigError(f"{path} does not describe a storage; name another run or train anew") from error
         url, best = storage
         require(url is None or isinstance(url, str), f"{path}: checkpoint_url must be a string, not {url!r}")
-        require(type(best) is int and best >= 0, f"{path}: keep_best must be an integer of at least 0, not {best!r}")
+        require(type(best) is int and best >= 0, f"{path}: keep_best must be a whole number >= 0, not {best!r}")
         return storage
 
     def checkpoint_location(self) -> Location:
