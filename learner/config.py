@@ -157,7 +157,7 @@ class RunConfig:
         )
 
     def learning_rate_at(self, env_steps: int) -> float:
-        """Adam's learning rate after `env_steps` env steps; a function of a counter in checkpoints, so resuming is exact."""
+        """Adam's learning rate after `env_steps` env steps, a function of a counter that checkpoints hold."""
         done = min(1.0, env_steps / self.learning_rate_decay_env_steps)
         if self.learning_rate_schedule == "cosine":
             done = (1.0 - math.cos(math.pi * done)) / 2.0
