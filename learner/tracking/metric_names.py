@@ -13,7 +13,7 @@ ENV_STEPS = "env_steps"
 
 
 class MetricSpec(NamedTuple):
-    """One metric: its names in the journal and in Ray, its kind, and its row in the operator's page (deploy/README)."""
+    """One metric: its names in the journal and in Ray, its kind, and the other columns of the table in learner/README."""
 
     journal: str
     name: str
@@ -179,4 +179,4 @@ HEALTH = (
 )
 
 METRICS: tuple[MetricSpec, ...] = (*THROUGHPUT, *LEARNING, *EVALUATION, *REPLAY, *TIMES, *ACCOUNTS, *HEALTH)
-"""All metrics, in the order of the operator's page."""
+"""All metrics, in the order of the table in learner/README.md."""

@@ -13,7 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from learner.config import RunConfig
 from learner.loop import TrainingLoop
-from learner.tracking.journal import Journal, charted
+from learner.tracking.journal import Journal, mlflow_metrics
 from learner.tracking.metric_names import ENV_STEPS, METRICS
 from learner.training.cluster import process_cluster
 from tests.checkpointing import Silent
@@ -68,7 +68,7 @@ def in_mlflow(journal: str) -> str:
     """What the README says of a metric: whether MLflow has it, whose step is the count of env steps."""
     if journal == ENV_STEPS:
         return "step"
-    return "yes" if charted({journal: 0.0}) else ""
+    return "yes" if mlflow_metrics({journal: 0.0}) else ""
 
 
 def test_the_readme_has_the_table():
