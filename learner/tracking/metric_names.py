@@ -13,7 +13,7 @@ ENV_STEPS = "env_steps"
 
 
 class MetricSpec(NamedTuple):
-    """One metric: its names in the journal and in Ray, its kind, and the other columns of the table in learner/README."""
+    """One metric: its names in the journal and in Ray, its kind, and its row in learner/README.md."""
 
     journal: str
     name: str

@@ -1,8 +1,4 @@
-<<<<<<< HEAD
 """The table of metrics: complete, valid names for Prometheus, and the same in learner/README.md."""
-=======
-"""The table of metrics: complete, valid in Prometheus, and the same on the operator's page."""
->>>>>>> b2bb49a (Tracking: plain sentences and standard names)
 
 import re
 from contextlib import closing
