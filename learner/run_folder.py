@@ -101,7 +101,7 @@ class RunFolder:
         try:
             storage = Storage(**_read(path))
         except TypeError as error:
-            raise ConfigError(f"{path} does not describe a storage; name another run or train anew") from error
+            raise ConfigError(f"{path} does not describe a storage; name another run or start a new one") from error
         url, best = storage
         require(url is None or isinstance(url, str), f"{path}: checkpoint_url must be a string, not {url!r}")
         require(type(best) is int and best >= 0, f"{path}: keep_best must be a whole number >= 0, not {best!r}")
@@ -126,7 +126,7 @@ class RunFolder:
         try:
             return RunIdentity(**values)
         except TypeError as error:
-            raise ConfigError(f"{self._identity} does not name a run; train anew") from error
+            raise ConfigError(f"{self._identity} does not name a run; start a new run") from error
 
 
 def find_run(name: str, runs_dir: Path) -> RunFolder:
@@ -154,7 +154,7 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         values = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} cannot be read ({error}); name another run or train anew") from error
+        raise ConfigError(f"{path} cannot be read ({error}); name another run or start a new one") from error
     if not isinstance(values, dict):
-        raise ConfigError(f"{path} is not a JSON object; name another run or train anew")
+        raise ConfigError(f"{path} is not a JSON object; name another run or start a new one")
     return values

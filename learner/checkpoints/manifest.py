@@ -81,13 +81,13 @@ def _refuse_other_format(text: bytes, is_intact: bool, where: object) -> None:
         return
     message = f"checkpoint {where} is in format {match[0]!r}, this version reads {FORMAT!r}: "
     if int(match[1]) < VERSION:
-        raise UnusableCheckpointError(message + "resume with the version of shoal that wrote it, or train anew")
+        raise UnusableCheckpointError(message + "resume with the version of shoal that wrote it, or start a new run")
     raise CheckpointError(message + "resume with a newer version of shoal")
 
 
 def damaged(where: object, what: str) -> UnusableCheckpointError:
     """The error for a checkpoint whose content is not what was written."""
-    return UnusableCheckpointError(f"checkpoint {where} is damaged ({what}); use an older one or train anew")
+    return UnusableCheckpointError(f"checkpoint {where} is damaged ({what}); use an older one or start a new run")
 
 
 def parse_object(text: bytes) -> dict[str, Any] | None:

@@ -53,7 +53,7 @@ def read_saved_policy(path: Path, config: RunConfig, shape: EnvShape) -> Weights
         with safe_open(str(path), "pt") as file:
             updates = int((file.metadata() or {})["updates"])
     except (OSError, SafetensorError, KeyError, ValueError) as error:
-        raise CheckpointError(f"the policy {path} cannot be read ({error}); train anew") from error
+        raise CheckpointError(f"the policy {path} cannot be read ({error}); start a new run") from error
     return _read(path, updates, QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions))
 
 

@@ -75,7 +75,7 @@ class Journal:
         if length < offset:
             self._file.close()
             raise ConfigError(
-                f"{path} has {length} bytes, its checkpoint needs {offset}: restore the whole file or train anew"
+                f"{path} has {length} bytes, its checkpoint needs {offset}: restore the whole file or start a new run"
             )
         self._file.truncate(offset)
         self._file.seek(offset)
