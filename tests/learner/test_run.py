@@ -9,9 +9,9 @@ from requests import ConnectionError as NoConnection
 from actors.policy.network import WeightsSnapshot
 from actors.service.fault_policy import Component, ComponentFailed, ComponentKind, Fault
 from actors.service.messages import EpisodeStats
+from learner.placement import Place
 from learner.run import RunSession
 from learner.run_folder import RunFolder
-from learner.training.cluster import Place
 from learner.training.recovery import RunLost
 from sim_core.outcomes import Outcome
 
