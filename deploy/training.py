@@ -13,7 +13,7 @@ from deploy.runs.artifacts import log_artifacts
 from learner.checkpoints.checkpoint import Checkpoint
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig, check_files_unchanged
-from learner.run import RunResult, execute
+from learner.run import RunResult, RunSession
 from learner.run_folder import RunFolder, RunIdentity
 from learner.tracking.journal import Row
 from learner.tracking.mlflow_run import Tracker
@@ -66,7 +66,7 @@ def run_training(
             display.message("logging curve, animation and policy")
             log_artifacts(folder, config, tracker, result, rows, display.message)
 
-        result = execute(folder, config, tracker, display, checkpoint, options, finish)
+        result = RunSession(folder, config, tracker, display, options).execute(checkpoint, finish)
     if result.evaluation is None:
         name = signal.Signals(result.stopped_by).name if result.stopped_by else "a signal"
         saved = "checkpoint saved" if result.checkpoint else "its checkpoint could not be written"

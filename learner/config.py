@@ -1,4 +1,4 @@
-"""The run's settings: one flat frozen dataclass beside the world's, checked when it is made."""
+"""The config of a run: one flat frozen dataclass beside that of the world, checked when it is made."""
 
 from __future__ import annotations
 
@@ -20,114 +20,114 @@ from sim_core.plugins import METHODS, SCENES, check_unchanged, identity
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """All that decides what a run learns; where it runs and is stored is no part of it.
+    """All settings that decide what a run learns, and the engine and device; other placement and storage are not here.
 
     Raises:
       ConfigError: a value is out of range or two values contradict each other.
     """
 
     world: WorldConfig = field(default_factory=WorldConfig)
-    """The setup and its world (used when env_id is ours)."""
+    """The setup and its world (used with our own env_id)."""
     env_id: str = ENV_ID
-    """Gymnasium id of the environment; any with Box observations and Discrete actions."""
+    """Gymnasium id of an environment with Box observations and Discrete actions."""
     seed: int = 0
     """Seed of every random stream of the run."""
     engine: Literal["ray", "process"] = "ray"
     """Ray actors, or everything in one process (deterministic, for tests and debugging)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where the learner's networks live: `auto` is CUDA where there is one, else the CPU."""
+    """Device of the learner's networks; `auto` takes CUDA if available, else the CPU."""
     total_env_steps: int = 3_000_000
     """Env steps to train for, over all workers."""
 
     workers: int = 1
     """Rollout workers."""
     envs_per_worker: int = 64
-    """Environments that one rollout worker steps at once."""
+    """Environments of one rollout worker, stepped as a batch."""
     steps_per_block: int = 128
-    """Env steps of each environment in one block of transitions."""
+    """Env steps of each environment in a block of transitions."""
     exploration: Literal["schedule", "ladder"] = "schedule"
-    """One falling epsilon for all workers, or Ape-X's ladder of constant ones."""
+    """One decaying epsilon for all workers, or Ape-X's ladder of a constant one per worker (Horgan et al. 2018)."""
     epsilon_start: float = 1.0
     """Schedule: exploration rate at the start."""
     epsilon_end: float = 0.05
     """Schedule: exploration rate after the decay (Table 3.2)."""
     epsilon_decay_env_steps: int = 400_000
-    """Schedule: env steps over which the rate falls linearly."""
+    """Schedule: env steps of the linear decay."""
     ladder_base: float = 0.4
-    """Ladder: rate of the most exploring worker."""
+    """Ladder: exploration rate of the worker that explores most."""
     ladder_exponent: float = 7.0
-    """Ladder: how steeply rates fall from worker to worker."""
+    """Ladder: how steeply the rate falls from worker to worker (alpha)."""
 
     replay_shards: int = 1
     """Replay shards."""
     replay_placement: Literal["learner", "actors"] = "learner"
-    """Shards in the learner's process, or each as a Ray actor of its own."""
+    """Shards in the learner's process, or each as its own Ray actor."""
     replay_capacity: int = 500_000
-    """Transitions that all shards hold together."""
+    """Capacity of all shards together, in transitions."""
     min_replay: int = 20_000
-    """Transitions that must be stored before the first update."""
+    """Transitions stored before the first update."""
     samples_per_insert: float = 2.0
-    """How often a stored transition is sampled on average (Reverb's rate limiter)."""
+    """How often a transition is sampled on average (as in Reverb's rate limiter)."""
     replay: Literal["uniform", "prioritised"] = "uniform"
-    """All transitions drawn alike, or in proportion to |TD error| ** priority_exponent (Schaul et al. 2016)."""
+    """Transitions sampled uniformly, or in proportion to |TD error| ** priority_exponent (Schaul et al. 2016)."""
     priority_exponent: float = 0.6
-    """Prioritised: 0 draws uniformly, 1 in proportion to |TD error| (alpha)."""
+    """Prioritised: 0 samples uniformly, 1 in proportion to |TD error| (alpha)."""
     importance_exponent_start: float = 0.4
-    """Prioritised: how much of the bias importance weights take away at the start (beta)."""
+    """Prioritised: exponent of the importance weights at the start (beta)."""
     importance_exponent_end: float = 1.0
-    """Prioritised: the same after the change; 1 takes all of it away."""
+    """Prioritised: beta after the schedule; 1 corrects the whole sampling bias."""
     importance_exponent_env_steps: int = 3_000_000
-    """Prioritised: env steps over which beta changes linearly."""
+    """Prioritised: env steps of beta's linear schedule."""
 
     algorithm: Literal["double_dqn", "dqn"] = "double_dqn"
-    """Target of the update: Double DQN (Algorithm 2) or DQN (Algorithm 1)."""
+    """TD target: Double DQN (Algorithm 2) or DQN (Algorithm 1)."""
     hidden_sizes: tuple[int, ...] = (128, 128)
-    """Width of the Q-network's hidden layers."""
+    """Widths of the Q-network's hidden layers."""
     network: Literal["plain", "dueling"] = "plain"
-    """One stream, or two for state value and advantages that split before the last hidden layer (Wang et al. 2016)."""
+    """One stream, or two, for state value and advantages, from the last hidden layer on (Wang et al. 2016)."""
     discount: float = 0.99
-    """gamma per env step (the text's lambda = 0.001 cannot be a discount)."""
+    """Discount per env step, gamma (the dissertation's lambda = 0.001 cannot be a discount)."""
     n_step: int = 3
-    """Env steps that a transition spans."""
+    """Env steps that a transition spans (n-step return)."""
     batch_size: int = 256
     """Transitions per update."""
     updates_per_call: int = 64
-    """Updates between two publications of the weights."""
+    """Updates between two publications of weights to the rollout workers."""
     learning_rate: float = 1e-3
-    """Adam's learning rate at the start (the text's lambda)."""
+    """Adam's learning rate at the start (the dissertation's lambda)."""
     learning_rate_end: float = 1e-4
     """Adam's learning rate after the decay."""
     learning_rate_decay_env_steps: int = 3_000_000
-    """Env steps over which the learning rate falls (constant: learning_rate_end = learning_rate)."""
+    """Env steps of the decay (for a constant rate: learning_rate_end = learning_rate)."""
     learning_rate_schedule: Literal["linear", "cosine"] = "linear"
-    """Falls along a line, or along half a cosine."""
+    """Linear decay, or half a cosine."""
     target_update: Literal["hard", "soft"] = "hard"
-    """Copies the online to the target network from time to time, or moves the target a little after every update."""
+    """Copy the online network to the target network at intervals, or blend it in after every update (Polyak)."""
     target_update_interval: int = 500
     """Hard: updates between two copies (C)."""
     target_update_rate: float = 0.005
-    """Soft: share of the online network in the target after an update (tau, Polyak's average)."""
+    """Soft: share of the online network blended in per update (tau)."""
     loss: Literal["huber", "mse"] = "huber"
-    """Of TD errors: Huber's, quadratic up to 1 and linear beyond, or their mean square."""
+    """Huber loss of the TD error (quadratic up to 1, linear beyond), or mean squared error."""
     max_gradient_norm: float = 10.0
-    """Gradients are scaled down to this norm."""
+    """Gradients with a larger norm are scaled down to it."""
     gradients: Literal["by_hand", "autograd"] = "by_hand"
-    """The update's gradients written out, compiled where they can be, or by PyTorch's autograd: equal to rounding."""
+    """Hand-written gradients (compiled where possible), or PyTorch's autograd: equal up to rounding."""
 
     eval_every_env_steps: int = 250_000
     """Env steps between two evaluations during training."""
     eval_episodes: int = 100
-    """Greedy episodes of an evaluation during training."""
+    """Greedy episodes per evaluation during training."""
     final_eval_episodes: int = 1_000
-    """Greedy episodes of the evaluation at the end."""
+    """Greedy episodes of the final evaluation."""
     final_eval_first_seed: int = 2_000_000_000
-    """Seed of the first of them; the others count on."""
+    """Seed of the first of them; each later one adds 1."""
     log_every_env_steps: int = 20_000
     """Env steps between two rows of training metrics."""
     checkpoint_every_env_steps: int = 500_000
     """Env steps between two checkpoints."""
     keep_checkpoints: int = 2
-    """Newest checkpoints that are kept."""
+    """How many of the newest checkpoints to keep."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -141,13 +141,13 @@ class RunConfig:
 
     @property
     def name(self) -> str:
-        """What people call a run of this config, such as `sensor 10r×2g s0`."""
+        """Name for users, such as `sensor 10r×2g s0`."""
         what = f"{self.world.method_name} {self.world.setup}" if self.env.is_swarm else self.env_id
         return f"{what} s{self.seed}"
 
     @property
     def epsilon_settings(self) -> Exploration:
-        """Settings of exploration as rollout workers take them."""
+        """Exploration settings of the rollout workers."""
         return Exploration(
             self.exploration,
             self.epsilon_start,
@@ -158,31 +158,31 @@ class RunConfig:
         )
 
     def learning_rate_at(self, env_steps: int) -> float:
-        """Adam's learning rate after `env_steps` env steps: a function of a counter that checkpoints hold."""
+        """Adam's learning rate after `env_steps` env steps, a function of a counter that checkpoints hold."""
         done = min(1.0, env_steps / self.learning_rate_decay_env_steps)
         if self.learning_rate_schedule == "cosine":
             done = (1.0 - math.cos(math.pi * done)) / 2.0
         return self.learning_rate + done * (self.learning_rate_end - self.learning_rate)
 
     def importance_exponent_at(self, env_steps: int) -> float:
-        """Exponent of the importance weights after `env_steps` env steps: a function of a counter as well."""
+        """Exponent of the importance weights after `env_steps` env steps (beta)."""
         done = min(1.0, env_steps / self.importance_exponent_env_steps)
         return self.importance_exponent_start + done * (self.importance_exponent_end - self.importance_exponent_start)
 
     @property
     def policy_sizes(self) -> tuple[int, ...]:
-        """Hidden sizes of the plain network that the learned policy acts with (see actors.policy.network.snapshot)."""
+        """Hidden sizes of the plain network that acts (see `actors.policy.network.snapshot`)."""
         *shared, last = self.hidden_sizes
         return (*shared, 2 * last) if self.network == "dueling" else self.hidden_sizes
 
     @property
     def block_env_steps(self) -> int:
-        """Env steps of one block."""
+        """Env steps in one block."""
         return self.envs_per_worker * self.steps_per_block
 
 
 WHERE = ("engine", "device")
-"""Settings that say where a run goes on, and nothing of what it learns."""
+"""Settings that place a run and have no influence on what it learns."""
 AT_LEAST_ONE = (
     "total_env_steps workers envs_per_worker steps_per_block epsilon_decay_env_steps "
     "learning_rate_decay_env_steps importance_exponent_env_steps replay_shards replay_capacity min_replay "
@@ -234,12 +234,12 @@ def _check_pairs(config: RunConfig) -> None:
 
 
 def to_dict(config: RunConfig) -> dict[str, Any]:
-    """The config as nested plain values for JSON and TOML."""
+    """The config as nested plain values, for JSON and TOML."""
     return dataclasses.asdict(config)
 
 
 def flat_params(config: RunConfig) -> dict[str, Any]:
-    """The whole config under flat names; the world's fields and the run's have no name in common."""
+    """The whole config in one flat dict; no field of the run and the world share a name."""
     values = to_dict(config)
     world: dict[str, Any] = values.pop("world")
     return values | world
@@ -262,10 +262,10 @@ def check_files_unchanged(config: RunConfig) -> None:
 
 
 def from_dict(values: dict[str, Any]) -> RunConfig:
-    """The config of nested plain values.
+    """The config in nested plain values; missing keys have their defaults.
 
     Raises:
-      ConfigError: a key is unknown, or a value cannot work.
+      ConfigError: a key is unknown, or a value is invalid.
     """
     world = values.get("world", {})
     require(isinstance(world, dict), f"world must be a section [world] of settings, not {world!r}")
@@ -292,7 +292,7 @@ def identity_dict(config: RunConfig) -> dict[str, Any]:
 
 
 def config_hash(config: RunConfig) -> str:
-    """Twelve hex digits that tell configs apart; how long and where a run goes on does not count."""
+    """Hash of a config, 12 hex digits; the length of the training and its placement do not count."""
     values = identity_dict(config)
     for name in ("total_env_steps", *WHERE):
         values.pop(name)

@@ -1,9 +1,15 @@
-"""One run as a whole: folder, tracker, cluster and loop put together, started or resumed."""
+"""One session of a run: restores a checkpoint or starts afresh, trains, evaluates, logs, and ends the MLflow run.
+
+A session is one process's work on a run; `shoal resume` begins the next one. A session makes one attempt or several:
+each trains with one set of components. When a component is lost that only a checkpoint can bring back, the next attempt
+starts from the newest checkpoint.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import closing
+from functools import cached_property
 from typing import NamedTuple
 
 from actors.evaluation.evaluator import evaluate_in_parallel
@@ -20,10 +26,10 @@ from learner.loop import TrainingLoop
 from learner.ray_backend.cluster import RayCluster
 from learner.ray_backend.metrics import RayMetrics
 from learner.run_folder import RunFolder
-from learner.tracking.delivery import Delivery, insist
+from learner.tracking.delivery import Delivery, retry
 from learner.tracking.fault_log import FaultLog
 from learner.tracking.journal import Journal, PushedMark, Row
-from learner.tracking.mlflow_run import TROUBLE, Tracker
+from learner.tracking.mlflow_run import MLFLOW_ERRORS, Tracker
 from learner.tracking.observer import Display, MirroringObserver
 from learner.tracking.redaction import hide_secrets
 from learner.training.cluster import Cluster, ProcessCluster
@@ -32,16 +38,18 @@ from learner.training.recovery import RunLost
 from learner.training.stop_signals import stop_on_signals
 
 LAST_FLUSH_S = 5.0
-"""How long a stopped run waits for MLflow; the next sitting delivers what it did not take."""
+"""How long a stopped run waits for MLflow; the next session delivers the rest."""
 
-MISFITS = (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError)
-"""What taking up a state of the wrong shape raises; a checksum cannot tell that it was written to do harm."""
+MISMATCH_ERRORS = (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError)
+"""What restoring a state of the wrong shape raises. Checksums do not protect against a state written to do harm."""
 
 
 class RunResult(NamedTuple):
-    """How a run ended; `evaluation`, its `episodes` and `weights` are None if a signal stopped it before its end.
+    """How a session ended.
 
-    `checkpoint` is the location of the checkpoint of its end, None if that could not be written.
+    `checkpoint` is the location of the session's last checkpoint, None if it could not be written. `stopped_by` is the
+    number of the signal that stopped the run before its end, else None. `evaluation` summarises the final greedy
+    `episodes`, played with `weights`; all three are None if the run was stopped.
     """
 
     env_steps: int
@@ -53,8 +61,159 @@ class RunResult(NamedTuple):
     weights: WeightsSnapshot | None
 
 
+class RunSession:
+    """This process's work on a run.
+
+    Args:
+      folder: the run's folder; the caller locks it if another process may train the run (`RunFolder.lock`).
+      config: the run's config.
+      tracker: its MLflow run, started or resumed.
+      display: shows progress to the user.
+      options: the Ray cluster that holds the run's components, and its deadlines.
+    """
+
+    def __init__(
+        self, folder: RunFolder, config: RunConfig, tracker: Tracker, display: Display, options: ClusterOptions
+    ) -> None:
+        self._folder = folder
+        self._config = config
+        self._tracker = tracker
+        self._display = display
+        self._options = options
+        self._fault_log = FaultLog(folder.faults)
+        self._fault_tracker = FaultTracker()
+
+    def execute(self, checkpoint: Checkpoint | None, finish: Callable[[RunResult, list[Row]], None]) -> RunResult:
+        """Trains to the end, evaluates, logs the result and ends the MLflow run.
+
+        Args:
+          checkpoint: where to resume, None for a fresh start.
+          finish: makes and logs the artifacts of a finished run from its result and all rows of metrics; called again
+            where MLflow fails.
+
+        Returns:
+          How the session ended. The MLflow run is FINISHED, or KILLED if a signal stopped it; then it can be resumed.
+
+        Raises:
+          RunFailed: a component fails again and again; the MLflow run is FAILED.
+        """
+        status = "FAILED"
+        try:
+            result, rows = self._train_and_evaluate(checkpoint)
+            if result.evaluation is not None:
+                self._log(result, result.evaluation, rows, finish)
+            status = "FINISHED" if result.stopped_by is None else "KILLED"
+            return result
+        except KeyboardInterrupt:
+            status = "KILLED"
+            raise
+        finally:
+            self._end(status)
+
+    def _train_and_evaluate(self, checkpoint: Checkpoint | None) -> tuple[RunResult, list[Row]]:
+        """Makes attempts until one succeeds; returns its result and all rows of metrics."""
+        incarnation = checkpoint.state["incarnation"] + 1 if checkpoint else 0
+        resumed = checkpoint is not None
+        while True:
+            try:
+                return self._attempt(checkpoint, incarnation, resumed)
+            except RunLost as lost:
+                incarnation = lost.incarnation + 1
+            resumed = False
+            checkpoint = last_checkpoint(self._folder, self._config)
+            self._display.message(f"going on from {checkpoint.folder if checkpoint else 'the start'}")
+
+    def _attempt(self, checkpoint: Checkpoint | None, incarnation: int, resumed: bool) -> tuple[RunResult, list[Row]]:
+        """Trains and evaluates with one set of components, whose first incarnation is `incarnation`.
+
+        Raises:
+          RunLost: a component is lost that only a checkpoint can bring back.
+        """
+        offset = checkpoint.state["journal_offset"] if checkpoint else 0
+        with closing(Journal(self._folder.journal, offset)) as journal:
+            cluster = open_cluster(self._config, incarnation, self._options)
+            with closing(
+                Delivery(self._tracker, journal, PushedMark(self._folder.pushed, offset), self._say)
+            ) as delivery:
+                delivery.deliver_up_to(offset)
+                observer = MirroringObserver(delivery, self._fault_log, self._display, self._monitor, resumed)
+                result = self._run_loop(checkpoint, journal, cluster, observer)
+                cluster.close()  # not after an error: references in its traceback must not outlive Ray
+                if result.evaluation is not None:
+                    delivery.deliver_up_to(journal.length)  # even if the last checkpoint could not be written
+                self._flush(delivery, result)
+                return result, journal.rows()
+
+    def _run_loop(
+        self, checkpoint: Checkpoint | None, journal: Journal, cluster: Cluster, observer: MirroringObserver
+    ) -> RunResult:
+        """Restores, trains, and evaluates the final policy.
+
+        Raises:
+          RunLost: see `_attempt`.
+        """
+        checkpoints, keep_best = self._folder.checkpoint_location(), self._folder.storage().keep_best
+        with stop_on_signals() as stop:
+            loop = TrainingLoop(
+                self._config, cluster, journal, checkpoints, observer, stop, self._fault_tracker, keep_best
+            )
+            try:
+                if checkpoint is not None:
+                    _restore(loop, checkpoint)
+                observer.ready()
+                if not loop.run():
+                    return RunResult(loop.env_steps, loop.updates, loop.saved, stop.signal, None, None, None)
+                self._display.message(f"training done; evaluating {self._config.final_eval_episodes} greedy episodes")
+                weights = loop.newest_weights()
+                episodes = final_evaluation(self._config, cluster, weights)
+            except ComponentFailed as failure:  # before or after the rounds of training
+                raise loop.lost(failure) from failure
+            return RunResult(loop.env_steps, loop.updates, loop.saved, None, summarise(episodes), episodes, weights)
+
+    @cached_property
+    def _monitor(self) -> Callable[[Row], None]:
+        """Exports rows to Prometheus; made once this process has joined Ray."""
+        return RayMetrics(self._folder.path.name).row if self._config.engine == "ray" else lambda row: None
+
+    def _say(self, text: str) -> None:
+        """Shows a line about MLflow, whose errors contain its address, without the address's password."""
+        self._display.message(hide_secrets(text, self._tracker.uri))
+
+    def _flush(self, delivery: Delivery, result: RunResult) -> None:
+        is_stopped = result.stopped_by is not None
+        reason = delivery.flush(LAST_FLUSH_S if is_stopped else max(LAST_FLUSH_S, self._tracker.retry_timeout_s))
+        if reason is not None:
+            self._say(f"MLflow lacks the newest metrics, which `shoal resume` sends again: {reason}")
+
+    def _log(
+        self,
+        result: RunResult,
+        evaluation: Evaluation,
+        rows: list[Row],
+        finish: Callable[[RunResult, list[Row]], None],
+    ) -> None:
+        """Logs the results and the artifacts of a finished run, and retries while MLflow fails."""
+        tracker, timeout_s = self._tracker, self._tracker.retry_timeout_s
+        metrics, time_ms = as_metrics(evaluation), self._time_of_results(result, rows)
+        retry(lambda: tracker.log_results(metrics, time_ms), "the results", timeout_s, self._say)
+        retry(lambda: finish(result, rows), "the artifacts", timeout_s, self._say)
+
+    def _time_of_results(self, result: RunResult, rows: list[Row]) -> int:
+        """A time in ms that is the same however often a result is logged, and differs once the run is trained on."""
+        last = rows[-1] if rows else Row(0, self._tracker.started_ms, {})
+        return last.time_ms + result.env_steps - last.env_steps
+
+    def _end(self, status: str) -> None:
+        """Ends the MLflow run; where MLflow fails, the next session ends it."""
+        timeout_s = self._tracker.retry_timeout_s if status == "FINISHED" else 0.0
+        try:
+            retry(lambda: self._tracker.end(status), f"that the run is {status}", timeout_s, self._say)
+        except MLFLOW_ERRORS as error:
+            self._say(f"MLflow does not know that the run is {status}: {first_line(error)}")
+
+
 def open_cluster(config: RunConfig, incarnation: int, options: ClusterOptions) -> Cluster:
-    """The run's parts under its engine."""
+    """Starts the run's components under its engine."""
     if config.engine == "process":
         return ProcessCluster(config, incarnation)
     return RayCluster(config, incarnation, options)
@@ -64,8 +223,8 @@ def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list
     """The newest usable checkpoint of a run, and why newer ones were skipped.
 
     Raises:
-      UnusableCheckpointError: there is none, or all are damaged or too old.
-      CheckpointError: it cannot be reached, is of a newer version, or belongs to another config.
+      UnusableCheckpointError: there is none, or all are damaged or in an older format.
+      CheckpointError: it cannot be reached, is in a newer format, or was made with another config.
     """
     checkpoint, skipped = newest_valid(folder.checkpoint_location())
     check_state(checkpoint)
@@ -74,10 +233,10 @@ def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list
 
 
 def last_checkpoint(folder: RunFolder, config: RunConfig) -> Checkpoint | None:
-    """The newest checkpoint of an earlier attempt; None where there is none of use, and the run begins anew.
+    """The newest usable checkpoint of a run; None if there is none, and the run must start afresh.
 
     Raises:
-      CheckpointError: it cannot be reached, is of a newer version, or belongs to another config.
+      CheckpointError: it cannot be reached, is in a newer format, or was made with another config.
     """
     try:
         return resume_point(folder, config)[0]
@@ -85,162 +244,16 @@ def last_checkpoint(folder: RunFolder, config: RunConfig) -> Checkpoint | None:
         return None
 
 
-def execute(
-    folder: RunFolder,
-    config: RunConfig,
-    tracker: Tracker,
-    display: Display,
-    checkpoint: Checkpoint | None,
-    options: ClusterOptions,
-    finish: Callable[[RunResult, list[Row]], None],
-) -> RunResult:
-    """Trains from the start or from `checkpoint`, evaluates, and closes the MLflow run.
-
-    Args:
-      folder: the run's folder, held if others may reach for it (`RunFolder.hold`).
-      config: the run.
-      tracker: its MLflow run, started or resumed.
-      display: shows progress.
-      checkpoint: where to go on, None for a fresh start.
-      options: of the cluster.
-      finish: makes and logs the artifacts of a finished run from the result and all rows of metrics.
-
-    Returns:
-      How the run ended; the MLflow run is FINISHED, KILLED (stopped by a signal, resumable) or FAILED.
-
-    Raises:
-      RunFailed: a part of it fails again and again.
-    """
-    status, say = "FAILED", _without_secrets(display, tracker)
-    try:
-        result, rows = _train(folder, config, tracker, display, checkpoint, options)
-        if result.evaluation is not None:
-            patience_s = tracker.patience_s
-            time_ms = _time_of_results(result, rows, tracker)
-            metrics = as_metrics(result.evaluation)
-            insist(lambda: tracker.final(metrics, time_ms), "the results", patience_s, say)
-            insist(lambda: finish(result, rows), "the artifacts", patience_s, say)
-        status = "FINISHED" if result.stopped_by is None else "KILLED"
-        return result
-    except KeyboardInterrupt:
-        status = "KILLED"
-        raise
-    finally:
-        _end(tracker, status, say)
-
-
-def _without_secrets(display: Display, tracker: Tracker) -> Callable[[str], None]:
-    """Shows what is said of MLflow, whose errors name its address, to a person."""
-    return lambda text: display.message(hide_secrets(text, tracker.uri))
-
-
-def _time_of_results(result: RunResult, rows: list[Row], tracker: Tracker) -> int:
-    """The same for the same results, which are stored once however often they are sent, and another for later ones."""
-    last = rows[-1] if rows else Row(0, tracker.started_ms, {})
-    return last.time_ms + result.env_steps - last.env_steps
-
-
-def _end(tracker: Tracker, status: str, say: Callable[[str], None]) -> None:
-    """Closes the MLflow run; one that cannot be closed is so by the next sitting."""
-    patience_s = tracker.patience_s if status == "FINISHED" else 0.0
-    try:
-        insist(lambda: tracker.end(status), f"that the run is {status}", patience_s, say)
-    except TROUBLE as error:
-        say(f"MLflow does not know that the run is {status}: {first_line(error)}")
-
-
-def _train(
-    folder: RunFolder,
-    config: RunConfig,
-    tracker: Tracker,
-    display: Display,
-    checkpoint: Checkpoint | None,
-    options: ClusterOptions,
-) -> tuple[RunResult, list[Row]]:
-    """Trains to the end, going back to the last checkpoint whenever a part is gone that only it can bring back."""
-    recovery, faults, say = FaultTracker(), FaultLog(folder.faults), _without_secrets(display, tracker)
-    incarnation = checkpoint.state["incarnation"] + 1 if checkpoint else 0
-    resumed = checkpoint is not None
-    monitor: Callable[[Row], None] | None = None
-    while True:
-        offset = checkpoint.state["journal_offset"] if checkpoint else 0
-        with closing(Journal(folder.journal, offset)) as journal:
-            cluster = open_cluster(config, incarnation, options)
-            monitor = monitor or _monitor(folder, config)
-            delivery = Delivery(tracker, journal, PushedMark(folder.pushed, offset), say)
-            delivery.up_to(offset)
-            with closing(delivery):
-                observer = MirroringObserver(delivery, faults, display, monitor, resumed)
-                try:
-                    result = _attempt(folder, config, display, checkpoint, journal, cluster, observer, recovery)
-                except RunLost as lost:
-                    incarnation = lost.incarnation + 1
-                else:
-                    cluster.close()  # not after an error: references in its traceback must not outlive Ray
-                    rows = journal.rows()
-                    if result.evaluation is not None:
-                        delivery.up_to(journal.length)  # even if the end has no checkpoint
-                    _deliver_rest(delivery, tracker, result, say)
-                    return result, rows
-        resumed = False
-        checkpoint = last_checkpoint(folder, config)
-        display.message(f"going on from {checkpoint.folder if checkpoint else 'the start'}")
-
-
-def _deliver_rest(delivery: Delivery, tracker: Tracker, result: RunResult, say: Callable[[str], None]) -> None:
-    left = delivery.flush(LAST_FLUSH_S if result.stopped_by is not None else max(LAST_FLUSH_S, tracker.patience_s))
-    if left is not None:
-        say(f"MLflow lacks the newest metrics, which `shoal resume` sends again: {left}")
-
-
 def _restore(loop: TrainingLoop, checkpoint: Checkpoint) -> None:
     try:
         loop.restore(checkpoint)
-    except MISFITS as error:
-        cause = getattr(error, "cause", error)  # what a Ray actor raised stands behind Ray's own error
+    except MISMATCH_ERRORS as error:
+        cause = getattr(error, "cause", error)  # Ray wraps what an actor raises
         raise CheckpointError(f"checkpoint {checkpoint.folder} does not fit this run: {cause}") from error
 
 
-def _monitor(folder: RunFolder, config: RunConfig) -> Callable[[Row], None]:
-    """Shows rows to Prometheus where this process has joined a Ray."""
-    return RayMetrics(folder.path.name).row if config.engine == "ray" else lambda row: None
-
-
-def _attempt(
-    folder: RunFolder,
-    config: RunConfig,
-    display: Display,
-    checkpoint: Checkpoint | None,
-    journal: Journal,
-    cluster: Cluster,
-    observer: MirroringObserver,
-    recovery: FaultTracker,
-) -> RunResult:
-    """Trains with one set of parts.
-
-    Raises:
-      RunLost: a part is gone that only a checkpoint can bring back.
-    """
-    with stop_on_signals() as stop:
-        keep_best = folder.storage().keep_best
-        loop = TrainingLoop(config, cluster, journal, folder.checkpoint_location(), observer, stop, recovery, keep_best)
-        try:
-            if checkpoint is not None:
-                _restore(loop, checkpoint)
-            observer.ready()
-            finished = loop.run()
-            if not finished:
-                return RunResult(loop.env_steps, loop.updates, loop.saved, stop.signal, None, None, None)
-            display.message(f"training done; evaluating {config.final_eval_episodes} greedy episodes")
-            weights = loop.newest_weights()
-            episodes = final_evaluation(config, cluster, weights)
-        except ComponentFailed as failure:  # outside of the rounds of training
-            raise loop.lost(failure) from failure
-        return RunResult(loop.env_steps, loop.updates, loop.saved, None, summarise(episodes), episodes, weights)
-
-
 def final_evaluation(config: RunConfig, cluster: Cluster, weights: WeightsSnapshot) -> EpisodeStats:
-    """Plays `weights` over `final_eval_episodes`, in parallel tasks that need none of the run's parts.
+    """Plays `final_eval_episodes` greedy episodes with `weights`, in parallel tasks that need no component of the run.
 
     Raises:
       RunFailed: a task fails again and again.

@@ -1,15 +1,15 @@
-"""A run's folder: its config, its MLflow identity, its journal and its checkpoints."""
+"""A run's folder: paths of its files, and reading and writing the small ones."""
 
 from __future__ import annotations
 
 import fcntl
 import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from actors.storage.atomic_write import replacing_file
 from actors.storage.uri import Location, parse_location
 from learner import file_names
 from learner.config import RunConfig, from_dict, to_dict, user_files
@@ -17,7 +17,7 @@ from sim_core.checks import ConfigError, require
 
 
 class RunIdentity(NamedTuple):
-    """Where the run is logged: run name, MLflow tracking URI, experiment and run id."""
+    """The run in MLflow: run name, tracking URI without its password, experiment and run id."""
 
     name: str
     tracking_uri: str
@@ -26,17 +26,17 @@ class RunIdentity(NamedTuple):
 
 
 class Storage(NamedTuple):
-    """How the run's checkpoints are stored: URL or folder (None: in the run's folder), and how many best ones stay."""
+    """Storage of the run's checkpoints: URL or folder (None: in the run's folder), and how many of the best to keep."""
 
     checkpoint_url: str | None = None
     keep_best: int = 0
 
 
 class RunFolder:
-    """Paths under one run's folder, and its small files.
+    """The folder of one run; `learner.file_names` describes its files.
 
     Args:
-      path: the folder.
+      path: the folder; it need not exist.
     """
 
     def __init__(self, path: Path) -> None:
@@ -51,15 +51,15 @@ class RunFolder:
         self._identity = self.path / file_names.IDENTITY
 
     def has_begun(self) -> bool:
-        """Whether a run has been started here, so far that it can go on."""
+        """Whether a run has been started here that can be resumed."""
         return self._identity.is_file()
 
     @contextmanager
-    def hold(self) -> Iterator[None]:
-        """Keeps every other process from training this run, until the end even if that is a kill.
+    def lock(self) -> Iterator[None]:
+        """Locks the run against training by other processes; the lock ends with the `with` block or the process.
 
         Raises:
-          ConfigError: another process holds it.
+          ConfigError: another process has locked it.
         """
         self.path.mkdir(parents=True, exist_ok=True)
         with (self.path / file_names.LOCK).open("w") as file:
@@ -81,7 +81,7 @@ class RunFolder:
         """Reads `config.json`.
 
         Raises:
-          ConfigError: the file is missing, no JSON, or holds another version's config.
+          ConfigError: the file is missing, not JSON, or from another version.
         """
         return from_dict(_read(self.path / file_names.CONFIG))
 
@@ -90,7 +90,7 @@ class RunFolder:
         write_json(self.path / file_names.STORAGE, storage._asdict())
 
     def storage(self) -> Storage:
-        """Reads `storage.json`; a run without one has its checkpoints in its folder.
+        """Reads `storage.json`; without that file, the checkpoints are in the run's folder.
 
         Raises:
           ConfigError: the file is damaged.
@@ -101,14 +101,14 @@ class RunFolder:
         try:
             storage = Storage(**_read(path))
         except TypeError as error:
-            raise ConfigError(f"{path} does not say where checkpoints are; name another run or train anew") from error
+            raise ConfigError(f"{path} does not describe a storage; name another run or start a new one") from error
         url, best = storage
-        require(url is None or isinstance(url, str), f"{path}: checkpoint_url must be a text, not {url!r}")
-        require(type(best) is int and best >= 0, f"{path}: keep_best must be a whole number from 0 on, not {best!r}")
+        require(url is None or isinstance(url, str), f"{path}: checkpoint_url must be a string, not {url!r}")
+        require(type(best) is int and best >= 0, f"{path}: keep_best must be a whole number >= 0, not {best!r}")
         return storage
 
     def checkpoint_location(self) -> Location:
-        """Where the run's checkpoints lie (see `storage` for errors)."""
+        """Location of the run's checkpoints (see `storage` for errors)."""
         url = self.storage().checkpoint_url
         return self.checkpoints if url is None else parse_location(url)
 
@@ -120,17 +120,17 @@ class RunFolder:
         """Reads `run.json`.
 
         Raises:
-          ConfigError: the file is missing or no run's.
+          ConfigError: the file is missing or does not name a run.
         """
         values = _read(self._identity)
         try:
             return RunIdentity(**values)
         except TypeError as error:
-            raise ConfigError(f"{self._identity} does not name a run; train anew") from error
+            raise ConfigError(f"{self._identity} does not name a run; start a new run") from error
 
 
 def find_run(name: str, runs_dir: Path) -> RunFolder:
-    """The run that a user names: a path, or a folder under `runs_dir`.
+    """The run that a user names by its path or by the name of its folder in `runs_dir`.
 
     Raises:
       ConfigError: there is none.
@@ -144,21 +144,17 @@ def find_run(name: str, runs_dir: Path) -> RunFolder:
 
 
 def write_json(path: Path, values: dict[str, Any]) -> None:
-    """Writes a JSON file; an older one is replaced once the new is whole."""
+    """Writes a JSON file atomically (see `replacing_file`)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    with part.open("w") as file:
-        json.dump(values, file, indent=2)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
+    with replacing_file(path, sync_first=True) as partial:
+        partial.write_text(json.dumps(values, indent=2))
 
 
 def _read(path: Path) -> dict[str, Any]:
     try:
         values = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} cannot be read ({error}); name another run or train anew") from error
+        raise ConfigError(f"{path} cannot be read ({error}); name another run or start a new one") from error
     if not isinstance(values, dict):
-        raise ConfigError(f"{path} is no config; name another run or train anew")
+        raise ConfigError(f"{path} is not a JSON object; name another run or start a new one")
     return values

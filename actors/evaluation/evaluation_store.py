@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
 import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from actors.rollout.vector_env import EnvSpec
 from actors.service.messages import EpisodeStats
+from actors.storage.atomic_write import replacing_folder
 from actors.storage.zarr_columns import load_rows, open_store, save_rows
 from sim_core.checks import ConfigError, require
 from sim_core.config import WorldConfig
@@ -56,17 +56,15 @@ def save_evaluation(path: Path, evaluation: StoredEvaluation) -> None:
     rows["seed"] = evaluation.seed
     for name, column in evaluation.stats._asdict().items():
         rows[name] = column
-    part = path.with_name(path.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    save_rows(part, rows, FORMAT)
     header: dict[str, Any] = {
         "env_id": evaluation.spec.env_id,
         "world": dataclasses.asdict(evaluation.spec.world),
         "player": evaluation.candidate,
         "updates": evaluation.updates,
     }
-    zarr.open_group(str(part), mode="r+").attrs.update({"header": header, "header_crc32": _crc32(header)})
-    part.rename(path)
+    with replacing_folder(path) as partial:
+        save_rows(partial, rows, FORMAT)
+        zarr.open_group(str(partial), mode="r+").attrs.update({"header": header, "header_crc32": _crc32(header)})
 
 
 def load_evaluation(path: Path) -> StoredEvaluation:

@@ -7,11 +7,11 @@ and a few dozen bytes per row.
 from __future__ import annotations
 
 import csv
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
+from actors.storage.atomic_write import replacing_file
 from sim_core.checks import ConfigError
 from sim_core.outcomes import ENDED, Outcome
 
@@ -64,14 +64,10 @@ _TYPES: dict[str, Any] = get_type_hints(ResultRow)
 def write_table(path: Path, rows: Iterable[ResultRow]) -> None:
     """Writes rows in a fixed order to a CSV file; an older file is replaced once the new one is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    with part.open("w", newline="", encoding="utf-8") as file:
+    with replacing_file(path, sync_first=True) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(ResultRow._fields)
         writer.writerows(sorted(rows))
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
 
 
 def read_table(path: Path) -> list[ResultRow]:

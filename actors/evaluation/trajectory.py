@@ -7,7 +7,6 @@ ends.
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from actors.storage.atomic_write import replacing_folder
 from actors.storage.zarr_columns import open_store
 from sim_core.config import WorldConfig
 
@@ -54,9 +54,12 @@ def save_episodes(path: Path, episodes: list[Episode], config: WorldConfig) -> N
     """
     if not episodes:
         raise ValueError("no episodes to save")
-    part = path.with_name(path.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    root = zarr.open_group(str(part), mode="w", zarr_format=3)
+    with replacing_folder(path) as partial:
+        _write(partial, episodes, config)
+
+
+def _write(path: Path, episodes: list[Episode], config: WorldConfig) -> None:
+    root = zarr.open_group(str(path), mode="w", zarr_format=3)
     root.attrs.update({"format": FORMAT, "config": dataclasses.asdict(config)})
     for key in TIME_KEYS:
         root.create_array(f"data/{key}", data=np.concatenate([getattr(episode, key) for episode in episodes]))
@@ -65,8 +68,6 @@ def save_episodes(path: Path, episodes: list[Episode], config: WorldConfig) -> N
     root.create_array("meta/goal", data=np.stack([episode.goal for episode in episodes]))
     for key in ("learner", "outcome", "seed"):
         root.create_array(f"meta/{key}", data=np.array([getattr(episode, key) for episode in episodes], np.int64))
-    shutil.rmtree(path, ignore_errors=True)
-    part.rename(path)
 
 
 def load_episodes(path: Path) -> tuple[list[Episode], WorldConfig]:

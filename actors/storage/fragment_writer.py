@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from actors.storage.atomic_write import sync_all
 from actors.storage.malloc import trim_heap
 from actors.storage.uri import Location, files_under, staged
 
@@ -90,18 +90,3 @@ def file_sum(path: Path) -> FileSum:
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         return FileSum(file.tell(), digest)
-
-
-def sync_all(path: Path) -> None:
-    """Makes a file, or a folder with everything in it, durable; the caller syncs the parent folder."""
-    for each in [path, *path.rglob("*")] if path.is_dir() else [path]:
-        sync(each)
-
-
-def sync(path: Path) -> None:
-    """Makes the content of a file, or the entries of a folder, durable (fsync)."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

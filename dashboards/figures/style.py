@@ -11,6 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from actors.storage.atomic_write import replacing_file
+
 TEXT, MUTED, GRID = "#1C2024", "#5A6470", "#E3E6EA"
 DPI = 100
 PALETTE_COLOURS = 128
@@ -47,8 +49,7 @@ def save_png(figure: Figure, path: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
     buffer.seek(0)
-    part = path.with_name(path.name + ".part")
     with Image.open(buffer) as image:
         few = image.convert("RGB").quantize(PALETTE_COLOURS, dither=Image.Dither.NONE)
-    few.save(part, format="PNG", optimize=True)
-    part.replace(path)
+    with replacing_file(path) as partial:
+        few.save(partial, format="PNG", optimize=True)

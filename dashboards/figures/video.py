@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.evaluation.trajectory import Episode
+from actors.storage.atomic_write import replacing_file
 from sim_core.checks import require_packages
 from sim_core.config import WorldConfig
 from sim_core.render import draw_world
@@ -43,12 +44,8 @@ def write_mp4(frames: Iterable[NDArray[np.uint8]], path: Path, frames_per_s: flo
     """
     if path.suffix != ".mp4":
         raise ValueError(f"{path} must end in .mp4")
-    part = path.with_name(f"{path.stem}.part.mp4")
-    try:
-        _encode(frames, part, frames_per_s)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with replacing_file(path) as partial:
+        _encode(frames, partial, frames_per_s)
 
 
 def _encode(frames: Iterable[NDArray[np.uint8]], path: Path, frames_per_s: float) -> None:
@@ -68,7 +65,7 @@ def _encode(frames: Iterable[NDArray[np.uint8]], path: Path, frames_per_s: float
         quality=None,
         pix_fmt_out="yuv420p",
         macro_block_size=1,
-        output_params=["-crf", CRF, "-movflags", "+faststart"],
+        output_params=["-crf", CRF, "-movflags", "+faststart", "-f", "mp4"],
     )
     with contextlib.closing(encoder):
         encoder.send(None)

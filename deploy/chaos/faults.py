@@ -69,8 +69,8 @@ def _ends(kind: FaultKind, entry: FaultEntry) -> bool:
     """Whether an entry of the fault log reports recovery from this kind of fault."""
     if kind.victim == DRIVER:
         return entry.event == "resumed"
-    all_rebuilt = entry.event == "resumed" or (entry.event == "mended" and entry.part == "learner")
-    return all_rebuilt or (entry.event == "mended" and entry.part.startswith(kind.victim))
+    all_rebuilt = entry.event == "resumed" or (entry.event == "mended" and entry.component == "learner")
+    return all_rebuilt or (entry.event == "mended" and entry.component.startswith(kind.victim))
 
 
 def fault_table(faults: list[InjectedFault]) -> Table:

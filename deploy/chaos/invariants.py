@@ -7,7 +7,7 @@ from contextlib import closing
 from actors.evaluation.statistics import Estimate, as_percent
 from learner.run import resume_point
 from learner.run_folder import RunFolder
-from learner.tracking.journal import ACCOUNT, FINAL, Journal, Row, charted
+from learner.tracking.journal import ACCOUNT, FINAL, Journal, Row, mlflow_metrics
 from learner.tracking.mlflow_history import MetricValue, MlflowHistory
 
 
@@ -51,7 +51,7 @@ def _undelivered(folder: RunFolder, rows: list[Row]) -> list[str]:
     """A sentence per metric whose history in MLflow differs from the journal's, and one if the run is not FINISHED."""
     history = MlflowHistory(folder.identity())
     wrong = []
-    for key in sorted({key for row in rows for key in charted(row.metrics)}):
+    for key in sorted({key for row in rows for key in mlflow_metrics(row.metrics)}):
         expected = sorted(
             MetricValue(row.time_ms, row.env_steps, row.metrics[key]) for row in rows if key in row.metrics
         )

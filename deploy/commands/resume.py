@@ -19,7 +19,7 @@ def run(command: Resume) -> int:
       ConfigError: there is no such run, it has no usable checkpoint, it has finished, or another process trains it.
     """
     folder = find_run(command.run, command.runs_dir)
-    with folder.hold():
+    with folder.lock():
         config = folder.config()
         checkpoint, skipped = resume_point(folder, config)
         config = _extended(config, command.total_env_steps, checkpoint.state["env_steps"])

@@ -13,7 +13,7 @@ from deploy.options.training import Launch, Submit, Sweep, Train
 from deploy.ray_jobs import Job, JobResult, JobServer
 from deploy.runs.folders import default_name, default_sweep_name
 from learner.config import config_hash
-from learner.sweep.grid import changed_settings
+from learner.sweep.grid import parse_overrides
 from learner.tracking.mlflow_run import COMMIT, git_commit
 from learner.training.stop_signals import StopRequest, stop_on_signals
 from sim_core.checks import require
@@ -99,7 +99,7 @@ def _user_files(job: Train | Sweep) -> dict[str, str]:
     if isinstance(job, Train):
         names = [(METHODS, job.run.world.method), (SCENES, job.run.world.scene)]
     else:
-        scene = changed_settings(job.grid.set)[1].get("scene")
+        scene = parse_overrides(job.grid.set)[1].get("scene")
         names = [(METHODS, method) for method in job.grid.methods] + ([(SCENES, scene)] if scene else [])
     found: dict[str, str] = {}
     for kind, name in names:

@@ -15,7 +15,7 @@ from deploy.options.training import Sweep
 from deploy.runs.folders import check_outlasts_job, check_plain_name, default_sweep_name
 from deploy.runs.sweep_results import SweepResults
 from learner.file_names import CELLS, LOCK, SWEEPS
-from learner.sweep.cell import SweepPlace
+from learner.sweep.cell import SweepLocation
 from learner.sweep.grid import Cell
 from learner.sweep.tune import run_cells
 from learner.tracking.mlflow_run import Tracker
@@ -88,13 +88,13 @@ def run(command: Sweep) -> int:
 
 def _run_missing(command: Sweep, name: str, results: SweepResults, missing: list[Cell], display: SweepDisplay) -> None:
     launch = command.launch
-    place = SweepPlace(results.folder / CELLS, launch.tracking(), launch.sweep_experiment(name))
+    location = SweepLocation(results.folder / CELLS, launch.tracking(), launch.sweep_experiment(name))
     # Makes the store and the experiment here, before several processes open them.
-    Tracker(place.tracking_uri, place.experiment, launch.artifact_root()).set_views()
+    Tracker(location.tracking_uri, location.experiment, launch.artifact_root()).set_views()
     results.record_provenance()
     with display:
         listener = _Listener(display, results)
-        run_cells(command.grid, missing, place, launch.ray_address(), command.at_once, listener)
+        run_cells(command.grid, missing, location, launch.ray_address(), command.at_once, listener)
 
 
 def _finish(console: Console, results: SweepResults, display: SweepDisplay) -> int:

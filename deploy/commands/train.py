@@ -45,7 +45,7 @@ def run(command: Train) -> int:
         require(launch.name is not None, "--or-resume needs --name, the run to resume")
     folder = _run_folder(config, launch, command.or_resume)
     if folder.has_begun():
-        with folder.hold():
+        with folder.lock():
             _check_storage(folder, command.checkpoint_url)
             return _resume(folder, config, launch.cluster_options())
     make_folder(launch.runs_dir, "--runs-dir")
@@ -57,7 +57,7 @@ def run(command: Train) -> int:
     storage = new_storage(command.checkpoint_url, folder.path.name, command.keep_best)
     tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
     tracker.start(config)
-    with folder.hold():
+    with folder.lock():
         folder.save_storage(storage)
         folder.save_config(config)
         folder.save_identity(RunIdentity(config.name, public_uri(tracker.uri), launch.experiment, tracker.run_id))

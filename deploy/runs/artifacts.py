@@ -51,7 +51,7 @@ def log_artifacts(
         except ConfigError as error:
             say(f"no animation: {error}")
     for path in written:
-        tracker.artifact(path)
+        tracker.log_artifact(path)
     tracker.log_policy(result.weights, config, env_shape(config.env), score(result.evaluation))
 
 

@@ -6,6 +6,7 @@ import os
 import re
 from pathlib import Path
 
+from actors.storage.atomic_write import replacing_file
 from actors.storage.uri import Location, check_writable, join_location, parse_location
 from learner.checkpoints.store import open_store
 from learner.config import RunConfig
@@ -84,9 +85,5 @@ def check_plain_name(name: str) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Writes a UTF-8 file atomically and durably: an older file stays until the new one is complete on disk."""
-    part = path.with_name(path.name + ".part")
-    with part.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
+    with replacing_file(path, sync_first=True) as partial:
+        partial.write_text(text, encoding="utf-8", newline="\n")

@@ -1,1 +1,1 @@
-"""Checkpoints: atomic writing, checksums, retention."""
+"""Checkpoints: atomic writing, checksums, retention. `checkpoint.py` states the protocol."""

@@ -1,6 +1,13 @@
-"""Checkpoints: whole or not there, with a checksum of every file; a reader trusts only what its manifest vouches for.
+"""A checkpoint is complete or does not exist, and a reader verifies every byte of it.
 
-The nodes write their parts (`actors.storage.fragment_writer`), then the driver adds the state and, last, the manifest.
+1. Each component of the run writes its fragment into a draft and syncs it (`actors.storage.fragment_writer`).
+2. The driver commits the draft: it adds `state.json` and then `manifest.json`, which holds the length and SHA-256 of
+   every file (`manifest.py`). In a folder, one rename makes the draft a checkpoint. Under a URL, writing the manifest
+   does: what has none is no checkpoint (`store.py`).
+3. A reader checks the manifest's own checksum, then the length and checksum of every file that it names. It skips a
+   damaged checkpoint for the next older one.
+
+`writer.py` runs steps 1 and 2 in the background.
 """
 
 from __future__ import annotations
@@ -14,7 +21,7 @@ from actors.storage.fragment_writer import FileSum
 from actors.storage.uri import Location
 from learner.checkpoints.manifest import (
     MANIFEST,
-    MOST_BYTES,
+    MAX_BYTES,
     STATE,
     CheckpointError,
     Manifest,
@@ -30,10 +37,11 @@ from learner.config import WHERE, RunConfig, flat_params, from_dict
 from sim_core.checks import ConfigError
 
 READ_BYTES = 2**20
+"""Bytes that are read at once to compute a checksum."""
 
 MAY_CHANGE = ("total_env_steps", *WHERE)
-"""Settings that may differ between two sittings of a run."""
-KINDS: dict[str, type] = {
+"""Settings that may change when a run is resumed."""
+STATE_TYPES: dict[str, type] = {
     "config": dict,
     "env_steps": int,
     "updates": int,
@@ -46,17 +54,18 @@ KINDS: dict[str, type] = {
     "learner": dict,
     "workers": list,
 }
+"""Fields of `state.json` and their types."""
 
 
 class Checkpoint(NamedTuple):
-    """A verified checkpoint: where its files lie, and the state of `state.json`."""
+    """A verified checkpoint: the location of its files, and the content of `state.json`."""
 
     folder: Location
     state: dict[str, Any]
 
 
 class Retention(NamedTuple):
-    """Which checkpoints stay: the newest so many, and the best so many by the evaluations during training."""
+    """Which checkpoints to keep: the `newest` ones, and the `best` ones by `scores` of evaluations during training."""
 
     newest: int
     best: int
@@ -66,37 +75,36 @@ class Retention(NamedTuple):
 def commit_checkpoint(
     store: CheckpointStore, draft: Location, env_steps: int, state: dict[str, Any], files: dict[str, FileSum]
 ) -> Location:
-    """Makes a draft with all parts written a checkpoint.
+    """Makes a draft that holds all fragments a checkpoint: adds the state and, last, the manifest.
 
     Args:
       store: the run's checkpoints.
-      draft: where the parts are.
+      draft: location of the fragments.
       env_steps: env steps so far.
-      state: the rest of the state, for JSON.
-      files: the parts' files.
+      state: the driver's state, JSON values.
+      files: length and checksum of the fragments' files.
 
     Returns:
       The checkpoint's location.
 
     Raises:
-      OSError: the storage does not take it; older checkpoints stay as they were.
+      OSError: the storage refuses it; older checkpoints are unchanged.
     """
     text = json.dumps(state).encode()
-    own = FileSum(len(text), hashlib.sha256(text).hexdigest())
-    manifest = encode_manifest(env_steps, {**files, STATE: own})
-    return store.location(store.complete(draft, {STATE: text, MANIFEST: manifest}))
+    state_sum = FileSum(len(text), hashlib.sha256(text).hexdigest())
+    manifest = encode_manifest(env_steps, {**files, STATE: state_sum})
+    return store.location(store.commit(draft, {STATE: text, MANIFEST: manifest}))
 
 
 def prune_checkpoints(store: CheckpointStore, last: Location, retention: Retention) -> None:
-    """Removes all checkpoints but those to keep, and what crashed writers left.
+    """Removes checkpoints that `retention` does not keep, and drafts of crashed writers.
 
-    What calls itself newer than `last`, the one just written, was skipped when the run was resumed: it goes too.
+    Checkpoints with more env steps than `last`, the one just written, were skipped as damaged when the run was resumed.
+    They are removed, too.
     """
     names = store.names()
-    own = names[[store.location(name) for name in names].index(last) :]
-    kept = names_to_keep(
-        [(name, env_steps_of(name)) for name in own], retention.newest, retention.best, retention.scores
-    )
+    candidates = names[[store.location(name) for name in names].index(last) :]
+    kept = names_to_keep([(name, env_steps_of(name)) for name in candidates], *retention)
     store.remove([name for name in names if name not in kept])
 
 
@@ -104,15 +112,15 @@ def read_checkpoint(store: CheckpointStore, name: str) -> Checkpoint:
     """Verifies every file of a checkpoint and reads its state.
 
     Raises:
-      UnusableCheckpointError: it is incomplete, damaged, or of an older format.
-      CheckpointError: it is of a newer format.
+      UnusableCheckpointError: it is incomplete, damaged, or in an older format.
+      CheckpointError: it is in a newer format.
     """
     location = store.location(name)
     manifest = decode_manifest(_small_file(store, name, MANIFEST), location)
     _verify(store, name, manifest)
     state = parse_object(_small_file(store, name, STATE))
     if state is None:
-        raise damaged(location, f"{STATE} is no JSON object")
+        raise damaged(location, f"{STATE} is not a JSON object")
     return Checkpoint(location, state)
 
 
@@ -126,9 +134,9 @@ def _open(store: CheckpointStore, name: str, file: str) -> OpenFile:
 def _small_file(store: CheckpointStore, name: str, file: str) -> bytes:
     opened, size = _open(store, name, file)
     with opened:
-        if size > MOST_BYTES:
-            raise damaged(store.location(name), f"{file} has {size} bytes, more than {MOST_BYTES}")
-        return opened.read(MOST_BYTES)
+        if size > MAX_BYTES:
+            raise damaged(store.location(name), f"{file} has {size} bytes, more than {MAX_BYTES}")
+        return opened.read(MAX_BYTES)
 
 
 def _verify(store: CheckpointStore, name: str, manifest: Manifest) -> None:
@@ -148,18 +156,22 @@ def _verify(store: CheckpointStore, name: str, manifest: Manifest) -> None:
 
 
 def newest_valid(root: Location) -> tuple[Checkpoint, list[str]]:
-    """The newest checkpoint that passes, and why newer ones were skipped.
+    """The newest checkpoint that passes verification, and why newer ones were skipped.
 
     Raises:
-      UnusableCheckpointError: there is none, or all are damaged or too old.
-      CheckpointError: the storage does not answer, or none passes and one is of a newer format.
+      UnusableCheckpointError: there is none, or all are damaged or in an older format.
+      CheckpointError: the storage does not answer, or none passes and one is in a newer format.
     """
     store, names = _listed(root)
     return _first_valid(root, store, names)
 
 
 def best_valid(root: Location, scores: list[Score]) -> tuple[Checkpoint, list[str]]:
-    """The checkpoint that did best in the evaluations during training and passes, and why better ones were skipped.
+    """The checkpoint with the best score that passes verification, and why better ones were skipped.
+
+    Args:
+      root: the run's checkpoints.
+      scores: the evaluations during training.
 
     Raises:
       CheckpointError: as for `newest_valid`; or no checkpoint has been evaluated.
@@ -167,16 +179,16 @@ def best_valid(root: Location, scores: list[Score]) -> tuple[Checkpoint, list[st
     store, names = _listed(root)
     best = best_first([(name, env_steps_of(name)) for name in names], scores)
     if names and not best:
-        raise CheckpointError(f"no checkpoint in {root} is as old as an evaluation; use the newest one")
+        raise CheckpointError(f"no checkpoint in {root} is from after an evaluation; use the newest one")
     return _first_valid(root, store, best)
 
 
 def valid_named(root: Location, name: str) -> Checkpoint:
-    """The checkpoint of that name, as `finished_names` lists it.
+    """The checkpoint `name`, one of `finished_names`, once it has passed verification.
 
     Raises:
-      UnusableCheckpointError: it is damaged or too old.
-      CheckpointError: there is none of that name, it is of a newer format, or the storage does not answer.
+      UnusableCheckpointError: it is damaged or in an older format.
+      CheckpointError: there is none of that name, it is in a newer format, or the storage does not answer.
     """
     store, names = _listed(root)
     if name not in names:
@@ -186,7 +198,7 @@ def valid_named(root: Location, name: str) -> Checkpoint:
 
 
 def finished_names(root: Location) -> list[str]:
-    """Names of the finished checkpoints, newest first; whether they are whole, a reader finds out.
+    """Names of the committed checkpoints, newest first; they are not verified.
 
     Raises:
       CheckpointError: the storage does not answer.
@@ -210,28 +222,34 @@ def _first_valid(root: Location, store: CheckpointStore, names: list[str]) -> tu
         except CheckpointError as error:
             skipped.append(error)
     reason = f": {skipped[0]}" if skipped else ""
-    useless = all(isinstance(error, UnusableCheckpointError) for error in skipped)
-    kind = UnusableCheckpointError if useless else CheckpointError
-    raise kind(f"no usable checkpoint in {root}{reason}")
+    all_unusable = all(isinstance(error, UnusableCheckpointError) for error in skipped)
+    error_type = UnusableCheckpointError if all_unusable else CheckpointError
+    raise error_type(f"no usable checkpoint in {root}{reason}")
 
 
 def check_state(checkpoint: Checkpoint) -> None:
-    """Raises UnusableCheckpointError unless the state has all fields, of the right kinds and no number below 0."""
-    for name, kind in KINDS.items():
+    """Raises UnusableCheckpointError unless the state has every field of STATE_TYPES, and no negative number there."""
+    for name, expected in STATE_TYPES.items():
         value = checkpoint.state.get(name)
-        if type(value) is not kind or (isinstance(value, int) and value < 0):
-            raise damaged(checkpoint.folder, f"state.json: {name} is no {kind.__name__}, or negative")
+        if type(value) is not expected or (isinstance(value, int) and value < 0):
+            raise damaged(checkpoint.folder, f"{STATE}: {name} must be of type {expected.__name__} and not negative")
 
 
-def check_config(checkpoint: Checkpoint, config: RunConfig, where: Path) -> None:
-    """Raises CheckpointError unless the checkpoint was made with `config`, which stands in the file `where`."""
+def check_config(checkpoint: Checkpoint, config: RunConfig, config_file: Path) -> None:
+    """Raises CheckpointError unless the checkpoint was made with `config`, but for what may change on a resume.
+
+    Args:
+      checkpoint: with a state that `check_state` accepts.
+      config: the run's config.
+      config_file: where the run's folder stores it, for the message.
+    """
     try:
         saved = flat_params(from_dict(checkpoint.state["config"]))
     except ConfigError as error:
-        raise CheckpointError(f"checkpoint {checkpoint.folder} is of another version of shoal: {error}") from error
+        raise CheckpointError(f"checkpoint {checkpoint.folder} is from another version of shoal: {error}") from error
     for name, value in flat_params(config).items():
         if name not in MAY_CHANGE and saved[name] != value:
             raise CheckpointError(
-                f"checkpoint {checkpoint.folder} was made with another config than {where}, where {name} is {value} "
-                f"instead of {saved[name]}; {', '.join(MAY_CHANGE)} alone may change between two sittings"
+                f"checkpoint {checkpoint.folder} was made with another config than {config_file}, where {name} is "
+                f"{value} instead of {saved[name]}; only {', '.join(MAY_CHANGE)} may change when a run is resumed"
             )

@@ -1,4 +1,4 @@
-"""Which checkpoints stay: the newest, and those that did best in the evaluations during training. Pure."""
+"""Which checkpoints to keep: the newest, and those with the best scores. Pure functions."""
 
 from __future__ import annotations
 
@@ -9,35 +9,40 @@ from learner.tracking.journal import Row
 
 
 class Score(NamedTuple):
-    """An evaluation during training: the env steps of its weights, and its success rate (else its mean return)."""
+    """Score of an evaluation during training: env steps of its weights, and success rate (or mean return)."""
 
     env_steps: int
     score: float
 
 
 def scores_of(rows: Iterable[Row]) -> list[Score]:
-    """The evaluations among rows of metrics."""
-    found = []
+    """The scores of the evaluations among rows of metrics."""
+    scores = []
     for row in rows:
         score = row.metrics.get("eval/success_rate", row.metrics.get("eval/return"))
         if score is not None:
-            found.append(Score(row.env_steps, score))
-    return found
+            scores.append(Score(row.env_steps, score))
+    return scores
 
 
 def score_at(env_steps: int, scores: list[Score]) -> float | None:
-    """Score of a checkpoint: the last evaluation of weights that are no newer; None before the first.
+    """Score of the checkpoint at `env_steps`: that of the last evaluation at or before it; None before the first.
 
-    Where evaluations and checkpoints fall due at the same env steps, that is one of the checkpoint's own weights.
+    Where evaluations and checkpoints are due at the same env steps, the evaluation is of the checkpoint's own weights.
     """
-    before = [scored for scored in scores if scored.env_steps <= env_steps]
-    return max(before, key=lambda scored: scored.env_steps).score if before else None
+    before = [score for score in scores if score.env_steps <= env_steps]
+    return max(before, key=lambda score: score.env_steps).score if before else None
 
 
 def best_first(checkpoints: list[tuple[str, int]], scores: list[Score]) -> list[str]:
-    """Names of the checkpoints that have a score, from the best to the worst; of two alike the newer first."""
-    scored = [(score_at(env_steps, scores), env_steps, name) for name, env_steps in checkpoints]
-    known = [(score, env_steps, name) for score, env_steps, name in scored if score is not None]
+    """Names of the checkpoints that have a score, best first; of equal scores the newer first.
+
+    Args:
+      checkpoints: (name, env steps) of each.
+      scores: evaluations so far.
+    """
+    all_scores = [(score_at(env_steps, scores), env_steps, name) for name, env_steps in checkpoints]
+    known = [(score, env_steps, name) for score, env_steps, name in all_scores if score is not None]
     return [name for _, _, name in sorted(known, reverse=True)]
 
 

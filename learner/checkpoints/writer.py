@@ -1,7 +1,8 @@
-"""Writes checkpoints in the background: the nodes' parts in their threads, state and manifest in one of the driver's.
+"""Writes checkpoints in the background while training goes on.
 
-Training stands still only while the nodes take their snapshots. A checkpoint that fails is told of, and costs nothing
-else: older ones stay, and the next one is tried as if nothing had happened.
+Each component writes its fragment in a thread of its own process. A thread of the driver waits for all of them and
+commits the checkpoint. Training pauses only while the components copy their state. A checkpoint that fails is reported;
+older ones stay, and the next one is tried when it is due.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from learner.checkpoints.checkpoint import Retention, commit_checkpoint, prune_c
 from learner.checkpoints.store import open_store
 
 DEADLINE_S = 900.0
-"""A part that is not written by then counts as failed."""
+"""Time after which a checkpoint fails whose fragments are not all written."""
 POLL_S = 0.05
-"""Time between two questions to the nodes whether they have written."""
+"""Time between two questions to a component whether it has written its fragment."""
 
 
 class RunPosition(NamedTuple):
-    """What a checkpoint is of: env steps and updates so far, and bytes of the journal that it covers."""
+    """How far a run is: env steps and updates so far, and bytes of its journal."""
 
     env_steps: int
     updates: int
@@ -33,9 +34,9 @@ class RunPosition(NamedTuple):
 
 
 class CheckpointResult(NamedTuple):
-    """How a checkpoint ended: its position, and its location or else why it could not be written.
+    """How writing a checkpoint ended: the run's position in it, and its location or the error.
 
-    `failure` tells of the part of the run that failed meanwhile, if that is why.
+    `failure` is the failed component, where that is the reason.
     """
 
     position: RunPosition
@@ -64,26 +65,26 @@ class CheckpointWriter:
     """Writes one checkpoint of a run at a time.
 
     Args:
-      root: where they lie.
-      calls: how to call the nodes, from another thread too.
-      patience_s: a part that does not answer for so long is late.
+      root: location of the run's checkpoints.
+      calls: calls the nodes; used from another thread, too.
+      answer_deadline_s: a component that does not answer for this long counts as late.
     """
 
-    def __init__(self, root: Location, calls: Calls, patience_s: float) -> None:
+    def __init__(self, root: Location, calls: Calls, answer_deadline_s: float) -> None:
         self._store = open_store(root)
         self._calls = calls
-        self._patience_s = patience_s
+        self._answer_deadline_s = answer_deadline_s
         self._thread: threading.Thread | None = None
-        self._ended: CheckpointResult | None = None
+        self._result: CheckpointResult | None = None
         self._abandoned = threading.Event()
 
     @property
     def is_busy(self) -> bool:
-        """Whether a checkpoint is being written, or its end has not been asked for."""
+        """Whether a checkpoint is being written, or its result has not been taken (see `poll`)."""
         return self._thread is not None
 
     def draft(self, env_steps: int) -> Location:
-        """Where the nodes are to write their parts of the next checkpoint."""
+        """Where the components write their fragments of the next checkpoint."""
         return self._store.draft(env_steps)
 
     def begin(
@@ -91,83 +92,90 @@ class CheckpointWriter:
         position: RunPosition,
         draft: Location,
         state: dict[str, Any],
-        writers: list[Placed[Checkpointable]],
-        seal: Callable[[], Retention],
+        components: list[Placed[Checkpointable]],
+        before_commit: Callable[[], Retention],
     ) -> None:
-        """Goes on in the background, once every part has begun to save.
+        """Waits for the fragments and commits the checkpoint, in the background.
 
         Args:
-          position: what the checkpoint is of.
-          draft: where the parts write.
-          state: the rest of the state, for JSON; nobody changes it any more.
-          writers: the parts.
-          seal: is called before the checkpoint is completed, in another thread; tells which ones stay afterwards.
+          position: the run's position in the checkpoint.
+          draft: where the fragments are written.
+          state: the driver's state, JSON values; nobody may change it any more.
+          components: those that have begun to save themselves.
+          before_commit: called in another thread before the commit; says which checkpoints to keep after it.
         """
 
         def write() -> None:
-            files = self._parts(writers)
-            keep = seal()
+            files = self._wait_for_fragments(components)
+            retention = before_commit()
             location = commit_checkpoint(self._store, draft, position.env_steps, state, files)
-            self._ended = CheckpointResult(position, location, None)
-            prune_checkpoints(self._store, location, keep)
+            self._result = CheckpointResult(position, location, None)
+            prune_checkpoints(self._store, location, retention)
 
         self._start(position, write)
 
-    def abort(self, position: RunPosition, writers: list[Placed[Checkpointable]], failure: ComponentFailed) -> None:
-        """Waits in the background until `writers` are ready for another checkpoint: this one could not begin.
+    def abort(self, position: RunPosition, components: list[Placed[Checkpointable]], failure: ComponentFailed) -> None:
+        """Fails a checkpoint that could not begin, once `components` can save themselves again; in the background.
 
         Args:
-          position: what the checkpoint would have been of.
-          writers: the parts that may have begun to save.
-          failure: of a part that did not, which the caller mends.
+          position: the run's position in it.
+          components: those that may have begun to save themselves.
+          failure: of a component that did not; the caller handles it.
         """
 
         def write() -> None:
-            self._parts(writers)
+            self._wait_for_fragments(components)
             raise OSError(str(failure))
 
         self._start(position, write)
 
     def _start(self, position: RunPosition, write: Callable[[], None]) -> None:
         assert self._thread is None
-        self._ended = None
-        self._thread = threading.Thread(
-            target=self._guard, args=(position, write), name="shoal-checkpoint", daemon=True
-        )
+        self._result = None
+        self._thread = threading.Thread(target=self._run, args=(position, write), name="shoal-checkpoint", daemon=True)
         self._thread.start()
 
-    def _guard(self, position: RunPosition, write: Callable[[], None]) -> None:
+    def _run(self, position: RunPosition, write: Callable[[], None]) -> None:
         try:
             write()
-        except Exception as error:  # a disk's, a storage client's, Ray's: each raises its own, and training goes on
-            # a new one: references in the traceback must not outlive Ray
+        except Exception as error:  # disks, storage clients and Ray raise their own types, and training must go on
+            # A new exception: references in the traceback of `error` must not outlive Ray.
             failure = ComponentFailed(*error.args) if isinstance(error, ComponentFailed) else None
-            self._ended = self._ended or CheckpointResult(position, None, first_line(error), failure)
-            self._tidy()
+            self._result = self._result or CheckpointResult(position, None, first_line(error), failure)
+            self._remove_drafts()
 
-    def _tidy(self) -> None:
+    def _remove_drafts(self) -> None:
         try:
-            self._store.remove([])  # the draft
+            self._store.remove([])
         except OSError:
-            pass  # whatever kept the checkpoint from being written; the next one tidies up
+            pass  # the storage is still unreachable; the next checkpoint removes them
 
-    def _parts(self, writers: list[Placed[Checkpointable]]) -> dict[str, FileSum]:
-        """Waits until all parts have written, even if one has failed: the next checkpoint must find them ready."""
+    def _wait_for_fragments(self, components: list[Placed[Checkpointable]]) -> dict[str, FileSum]:
+        """Waits until all fragments are written, even if one has failed: then all components can save again.
+
+        Returns:
+          Length and checksum of the fragments' files, by name.
+
+        Raises:
+          ComponentFailed: a component failed.
+          OSError: a fragment could not be written, or not in time.
+          Abandoned: see `abandon`.
+        """
         deadline_s = time.monotonic() + DEADLINE_S
-        waiting, written, failures = list(writers), [], []
+        waiting, written, failures = list(components), [], []
         while waiting:
-            for writer in list(waiting):
+            for component in list(waiting):
                 try:
-                    answer = self._ask(writer)
+                    answer = self._ask(component)
                 except ComponentFailed as failure:
                     failures.append(failure)
-                    waiting.remove(writer)
+                    waiting.remove(component)
                     continue
                 if answer is not None:
                     written.append(answer)
-                    waiting.remove(writer)
+                    waiting.remove(component)
             if waiting and time.monotonic() > deadline_s:
-                late = ", ".join(sorted(str(writer.component) for writer in waiting))
+                late = ", ".join(sorted(str(each.component) for each in waiting))
                 raise TimeoutError(f"{late} did not write within {DEADLINE_S:.0f} s")
             if waiting and self._abandoned.wait(POLL_S):
                 raise Abandoned
@@ -175,45 +183,45 @@ class CheckpointWriter:
             raise failures[0]
         return _files(written)
 
-    def _ask(self, writer: Placed[Checkpointable]) -> WriteResult | None:
-        """How a part's write ended; None while it is being written.
+    def _ask(self, component: Placed[Checkpointable]) -> WriteResult | None:
+        """How the component's write ended; None while it is writing.
 
         Raises:
           ComponentFailed: it does not answer.
-          Abandoned: the run does not go on like this.
+          Abandoned: see `abandon`.
         """
-        late_s = time.monotonic() + self._patience_s
+        deadline_s = time.monotonic() + self._answer_deadline_s
         try:
-            ref = self._calls.start(writer.node, Checkpointable.saved)
+            ref = self._calls.start(component.node, Checkpointable.saved)
             while not self._calls.wait([ref], POLL_S):
                 if self._abandoned.is_set():
                     raise Abandoned
-                if time.monotonic() > late_s:
-                    raise CallFailed(Fault.LATE, f"silent for {self._patience_s:.0f} s")
+                if time.monotonic() > deadline_s:
+                    raise CallFailed(Fault.LATE, f"silent for {self._answer_deadline_s:.0f} s")
             return self._calls.get(ref)
         except CallFailed as failure:
-            raise failure.of(writer.component, writer.incarnation, "saved") from failure
+            raise failure.of(component.component, component.incarnation, "saved") from failure
 
     def poll(self) -> CheckpointResult | None:
-        """How the checkpoint under way ended, told once; None while it is being written, or there is none."""
+        """Takes the result of the checkpoint being written; None while it is being written, or if there is none."""
         return None if self._thread is None or self._thread.is_alive() else self.wait()
 
     def wait(self) -> CheckpointResult | None:
-        """Waits for the checkpoint under way and tells how it ended; None if there is none."""
+        """Waits for the checkpoint being written and takes its result; None if there is none."""
         if self._thread is None:
             return None
         self._thread.join()
         self._thread = None
-        return self._ended
+        return self._result
 
     def abandon(self) -> None:
-        """Waits for no part any more: the run ends, or goes on with others. What writes does not outlive this call."""
+        """Stops waiting for fragments: the run ends, or goes on with other components. Returns once nothing writes."""
         self._abandoned.set()
         self.wait()
 
 
 def _files(written: list[WriteResult]) -> dict[str, FileSum]:
-    """The files of all parts.
+    """The files of all fragments.
 
     Raises:
       OSError: one could not be written.

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from actors.policy.network import NETWORKS, DuelingNetwork, QNetwork, WeightsSnapshot, load_snapshot, snapshot
 from actors.rollout.vector_env import EnvShape
+from actors.storage.atomic_write import replacing_file
 from actors.storage.uri import fetched, join_location
 from learner.checkpoints.checkpoint import Checkpoint
 from learner.checkpoints.manifest import CheckpointError, damaged
@@ -38,9 +39,8 @@ def save_policy(path: Path, weights: WeightsSnapshot, config: RunConfig, shape: 
     network = QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions)
     load_snapshot(network, weights)
     tensors = {f"{ONLINE}{name}": tensor for name, tensor in network.state_dict().items()}
-    part = path.with_name(path.name + ".part")
-    save_file(tensors, str(part), metadata={"updates": str(weights.version)})
-    part.replace(path)
+    with replacing_file(path) as partial:
+        save_file(tensors, str(partial), metadata={"updates": str(weights.version)})
 
 
 def read_saved_policy(path: Path, config: RunConfig, shape: EnvShape) -> WeightsSnapshot:
@@ -53,7 +53,7 @@ def read_saved_policy(path: Path, config: RunConfig, shape: EnvShape) -> Weights
         with safe_open(str(path), "pt") as file:
             updates = int((file.metadata() or {})["updates"])
     except (OSError, SafetensorError, KeyError, ValueError) as error:
-        raise CheckpointError(f"the policy {path} cannot be read ({error}); train anew") from error
+        raise CheckpointError(f"the policy {path} cannot be read ({error}); start a new run") from error
     return _read(path, updates, QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions))
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from actors.storage.atomic_write import replacing_folder
 from learner.export.ports import Port
 from learner.export.reference_states import Sensed
 from sim_core.checks import ConfigError, require_packages
@@ -186,22 +186,17 @@ def write_export(
     """
     check_packages()
     check_folder(folder)
-    part = folder.with_name(folder.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
     described = {**metadata, "inputs": [p.described() for p in inputs], "outputs": [p.described() for p in outputs]}
     text = json.dumps(described, ensure_ascii=False)
-    try:
+    with replacing_folder(folder) as partial:
+        partial.mkdir(parents=True)
         program = _program(module, inputs)
-        _save_onnx(program, inputs, outputs, text, part / ONNX)
-        torch.export.save(program, part / PROGRAM, extra_files={METADATA_KEY: text})
-        found = _checked(part, outputs, states)
+        _save_onnx(program, inputs, outputs, text, partial / ONNX)
+        torch.export.save(program, partial / PROGRAM, extra_files={METADATA_KEY: text})
+        found = _checked(partial, outputs, states)
         checks = {name: answer._asdict() for name, answer in found.items()}
-        (part / METADATA).write_text(json.dumps({**described, "checked": checks}, indent=2, ensure_ascii=False))
-        _save_golden(part / GOLDEN, states)
-        _replace(folder, part)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+        (partial / METADATA).write_text(json.dumps({**described, "checked": checks}, indent=2, ensure_ascii=False))
+        _save_golden(partial / GOLDEN, states)
     return found
 
 
@@ -220,12 +215,3 @@ def _save_golden(path: Path, states: Sensed) -> None:
     arrays = {f"in.{name}": array[:GOLDEN_STATES] for name, array in states.inputs.items()}
     arrays |= {f"out.{name}": array[:GOLDEN_STATES] for name, array in states.expected.items()}
     np.savez_compressed(path, allow_pickle=False, **arrays)
-
-
-def _replace(folder: Path, part: Path) -> None:
-    old = folder.with_name(folder.name + ".old")
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.rename(old)
-    part.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)

@@ -7,7 +7,7 @@ import math
 from ray.util.metrics import Counter, Gauge
 
 from learner.tracking.journal import Row
-from learner.tracking.metric_names import ENV_STEPS, METRICS, Exported
+from learner.tracking.metric_names import ENV_STEPS, METRICS, MetricSpec
 
 RUN = "run"
 """The label that distinguishes runs."""
@@ -41,5 +41,5 @@ class RayMetrics:
                 self._counted[name] += more
 
 
-def _made(kind: type[Counter] | type[Gauge], known: Exported) -> Counter | Gauge:
+def _made(kind: type[Counter] | type[Gauge], known: MetricSpec) -> Counter | Gauge:
     return kind(known.name, f"{known.unit}: {known.meaning}", (RUN,))

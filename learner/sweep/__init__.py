@@ -1,1 +1,1 @@
-"""A grid of trainings: its cells, and running them on Ray Tune."""
+"""A grid of trainings: `grid.py` makes its cells, `tune.py` schedules them, `cell.py` runs one and logs to MLflow."""

@@ -1,7 +1,7 @@
-"""One cell of a sweep, from its training to its results, resumable at any moment.
+"""Runs one cell of a sweep: trains, evaluates, and logs to the cell's MLflow run. Resumable at any time.
 
-A cell's folder is a run's folder with `results.csv` in it, written last: where it stands, the cell is done. Its
-MLflow run is found again by the cell's key, so that no crash makes a second one.
+A cell's folder is a run's folder. Its `results.csv` is written last, and its presence means that the cell is done. The
+cell's MLflow run has the cell's key as a tag: a session after a crash finds it by that tag and continues it.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig
 from learner.export.policy_file import read_saved_policy, save_policy
 from learner.file_names import EVALUATIONS
-from learner.run import RunResult, execute, last_checkpoint
+from learner.run import RunResult, RunSession, last_checkpoint
 from learner.run_folder import RunFolder, RunIdentity
-from learner.sweep.grid import Cell, SweepConfig, cell_hash, done_cells, other_worlds
+from learner.sweep.grid import Cell, SweepConfig, cell_hash, done_cells, extrapolation_worlds
 from learner.tracking.journal import Row
 from learner.tracking.mlflow_run import Tracker
 from learner.tracking.redaction import public_uri
@@ -37,8 +37,8 @@ from sim_core.config import WorldConfig
 from sim_core.outcomes import ENDED
 
 
-class SweepPlace(NamedTuple):
-    """Where a sweep's cells lie and are logged."""
+class SweepLocation(NamedTuple):
+    """Where a sweep stores its cells, and where it logs them: MLflow tracking URI and experiment."""
 
     cells: Path
     tracking_uri: str
@@ -46,15 +46,15 @@ class SweepPlace(NamedTuple):
 
     @property
     def sweep(self) -> str:
-        """The sweep's name: that of the folder which holds its cells."""
+        """The sweep's name, which is the name of its folder."""
         return self.cells.parent.name
 
 
 class RowDisplay:
-    """Passes a run's rows on; implements `learner.tracking.observer.Display`.
+    """Passes a run's rows on and drops its messages; implements `learner.tracking.observer.Display`.
 
     Args:
-      on_row: is called with every row.
+      on_row: called with every row.
     """
 
     def __init__(self, on_row: Callable[[Row], None]) -> None:
@@ -65,11 +65,11 @@ class RowDisplay:
         self._on_row(row)
 
     def message(self, text: str) -> None:
-        """A cell says nothing."""
+        """Drops the message."""
 
 
 def result_row(sweep: SweepConfig, cell: Cell, played: WorldConfig, stats: EpisodeStats) -> ResultRow:
-    """The row of one evaluation of a cell's policy, in the world `played`."""
+    """The row of one evaluation of a cell's policy, which played in the world `played`."""
     config = cell.config
     counts = {kind.name.lower(): int((stats.outcome == kind).sum()) for kind in ENDED}
     return ResultRow(
@@ -88,17 +88,17 @@ def result_row(sweep: SweepConfig, cell: Cell, played: WorldConfig, stats: Episo
     )
 
 
-def _start_or_find(cell: Cell, sweep: SweepConfig, folder: RunFolder, place: SweepPlace) -> Tracker:
-    """The cell's MLflow run: that of its folder, or one that carries its key, or a new one."""
-    tracker = Tracker(place.tracking_uri, place.experiment, None)
-    known = tracker.find_run({"cell": cell.key, "sweep": place.sweep})
+def _start_or_resume(cell: Cell, sweep: SweepConfig, folder: RunFolder, location: SweepLocation) -> Tracker:
+    """The cell's MLflow run: the one that has the cell's key and sweep as tags, or a new one."""
+    tracker = Tracker(location.tracking_uri, location.experiment, None)
+    known = tracker.find_run({"cell": cell.key, "sweep": location.sweep})
     if known:
         tracker.resume(known)
-        tracker.log_inputs(cell.config)  # which a kill may have kept from it
+        tracker.log_inputs(cell.config)  # a kill may have prevented it
     else:
-        tracker.start(cell.config, {"sweep": place.sweep} | _tags(cell, sweep))
+        tracker.start(cell.config, {"sweep": location.sweep} | _tags(cell, sweep))
     folder.save_config(cell.config)
-    folder.save_identity(RunIdentity(cell.name, public_uri(tracker.uri), place.experiment, tracker.run_id))
+    folder.save_identity(RunIdentity(cell.name, public_uri(tracker.uri), location.experiment, tracker.run_id))
     return tracker
 
 
@@ -112,32 +112,32 @@ def _tags(cell: Cell, sweep: SweepConfig) -> dict[str, str]:
     }
 
 
-def run_cell(sweep: SweepConfig, cell: Cell, place: SweepPlace, on_row: Callable[[Row], None]) -> Path:
-    """Trains and evaluates a cell in this process, from where an earlier attempt was.
+def run_cell(sweep: SweepConfig, cell: Cell, location: SweepLocation, on_row: Callable[[Row], None]) -> Path:
+    """Trains and evaluates a cell in this process, or resumes it from its last checkpoint.
 
     Args:
       sweep: the sweep.
       cell: one of its cells.
-      place: where it lies.
-      on_row: is called with every row of training metrics.
+      location: where the sweep stores and logs its cells.
+      on_row: called with every row of training metrics.
 
     Returns:
-      The cell's table of results.
+      Path of the cell's table of results.
     """
-    folder = RunFolder(place.cells / cell.key)
+    folder = RunFolder(location.cells / cell.key)
     if folder.results.is_file() and done_cells(sweep, [cell], read_table(folder.results)):
         return folder.results
     checkpoint = last_checkpoint(folder, cell.config)
-    tracker = _start_or_find(cell, sweep, folder, place)
+    tracker = _start_or_resume(cell, sweep, folder, location)
     if cell.policy != LEARNED:
         with tracker.ending():
             _play_baseline(sweep, cell, folder, tracker)
     elif folder.policy.is_file() and not folder.checkpoints.exists():
         with tracker.ending():
-            _play_again(sweep, cell, folder, tracker)
+            _evaluate_again(sweep, cell, folder, tracker)
     else:
-        _train(sweep, cell, folder, tracker, checkpoint, on_row)  # ends its MLflow run itself
-    _new_table(folder).rename(folder.results)  # once MLflow has all and its run is closed
+        _train(sweep, cell, folder, tracker, checkpoint, on_row)  # ends the MLflow run itself
+    _new_table(folder).rename(folder.results)  # once MLflow has everything and the run is ended
     shutil.rmtree(folder.checkpoints, ignore_errors=True)  # the policy and the results stay
     return folder.results
 
@@ -150,20 +150,20 @@ def _train(
     checkpoint: Checkpoint | None,
     on_row: Callable[[Row], None],
 ) -> None:
-    """Trains from a checkpoint or the start, and evaluates the policy."""
+    """Trains from the checkpoint or afresh, and evaluates the policy."""
     if checkpoint is None:
-        tracker.skip_what_is_logged()  # the same cell makes the same rows again, at another time
+        tracker.skip_logged_metrics()  # of a session that left no checkpoint: the same values, measured at another time
 
     def finish(result: RunResult, rows: list[Row]) -> None:
         assert result.weights is not None and result.episodes is not None and result.evaluation is not None
         shape = env_shape(cell.config.env)
         save_policy(folder.policy, result.weights, cell.config, shape)
         results = _evaluate_all(sweep, cell, folder, result.weights, result.episodes)
-        tracker.artifact(folder.policy)
+        tracker.log_artifact(folder.policy)
         tracker.log_policy(result.weights, cell.config, shape, score(result.evaluation))
         _log_table(results, folder, tracker)
 
-    execute(folder, cell.config, tracker, RowDisplay(on_row), checkpoint, ClusterOptions(), finish)
+    RunSession(folder, cell.config, tracker, RowDisplay(on_row), ClusterOptions()).execute(checkpoint, finish)
 
 
 def _fixed_seeds(cell: Cell) -> list[int]:
@@ -171,25 +171,25 @@ def _fixed_seeds(cell: Cell) -> list[int]:
     return list(range(first, first + cell.config.final_eval_episodes))
 
 
-def _play_again(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker) -> None:
-    """Evaluates the kept policy of a cell that was done, in a sweep that wants it played in more setups."""
+def _evaluate_again(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker) -> None:
+    """Evaluates the stored policy of a cell that was done, where the sweep now asks for more setups or episodes."""
     weights = read_saved_policy(folder.policy, cell.config, env_shape(cell.config.env))
     fixed = evaluate(cell.config.env, weights, _fixed_seeds(cell))
     _log_table(_evaluate_all(sweep, cell, folder, weights, fixed), folder, tracker)
 
 
 def _play_baseline(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker) -> None:
-    """Plays a baseline's episodes, of which there is nothing to resume."""
+    """Evaluates a baseline."""
     stats = evaluate(cell.config.env, Baseline(cell.policy), _fixed_seeds(cell))
-    tracker.final(as_metrics(summarise(stats)), tracker.started_ms)
+    tracker.log_results(as_metrics(summarise(stats)), tracker.started_ms)
     _log_table([_stored(sweep, cell, cell.config, stats, folder, 0)], folder, tracker)
 
 
 def _log_table(results: list[ResultRow], folder: RunFolder, tracker: Tracker) -> None:
-    """Writes and logs the table of a cell's results, which does not count yet."""
+    """Writes and logs the table of a cell's results, not yet in the place that marks the cell as done."""
     table = _new_table(folder)
     write_table(table, results)
-    tracker.artifact(table)
+    tracker.log_artifact(table)
 
 
 def _new_table(folder: RunFolder) -> Path:
@@ -199,11 +199,11 @@ def _new_table(folder: RunFolder) -> Path:
 def _evaluate_all(
     sweep: SweepConfig, cell: Cell, folder: RunFolder, weights: WeightsSnapshot, fixed: EpisodeStats
 ) -> list[ResultRow]:
-    """Stores the Fixed evaluation, makes and stores the Extrapolations, and counts them all."""
+    """Makes the Extrapolation evaluations, and stores them and the Fixed one; returns all rows of results."""
     config = cell.config
     results = [_stored(sweep, cell, config, fixed, folder, weights.version)]
     seeds = list(range(sweep.first_seed, sweep.first_seed + sweep.extrapolation_episodes))
-    for world in other_worlds(sweep, cell):
+    for world in extrapolation_worlds(sweep, cell):
         played = dataclasses.replace(config, world=world)
         results.append(_stored(sweep, cell, played, evaluate(played.env, weights, seeds), folder, weights.version))
     return results
@@ -215,7 +215,7 @@ def _stored(
     world = played.world
     path = folder.path / EVALUATIONS / f"{world.robots}r{world.groups}g.zarr"
     path.parent.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(path, ignore_errors=True)  # of an attempt that did not come to its end
+    shutil.rmtree(path, ignore_errors=True)  # from a session that was killed
     seeds = np.arange(sweep.first_seed, sweep.first_seed + len(stats.outcome))
     save_evaluation(path, StoredEvaluation(played.env, cell.name, updates, seeds, stats))
     return result_row(sweep, cell, world, stats)

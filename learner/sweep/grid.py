@@ -1,4 +1,4 @@
-"""A sweep: robots x groups x method x seed as cells, each one training and its evaluations. Pure; runs nothing."""
+"""The grid of a sweep: for each method, setup and seed a cell, one training with its evaluations. Pure functions."""
 
 from __future__ import annotations
 
@@ -23,38 +23,38 @@ BaselineName = Literal["fl-orca", "greedy", "random"]
 
 @dataclass(frozen=True, kw_only=True)
 class SweepConfig:
-    """Which cells a sweep has and how they are evaluated.
+    """The cells of a sweep, and how they are evaluated.
 
     Raises:
       ConfigError: a value is out of range.
     """
 
     preset: PresetName = "thesis"
-    """Settings of every training: the text's reading, or our best."""
+    """Settings of every training: those of the dissertation, or our best."""
     methods: tuple[str, ...] = ("sensor", "in", "out")
     """State representations: names, or FILE.py:CLASS."""
     set: tuple[str, ...] = ()
-    """Settings in place of the preset's, as NAME=VALUE: any field of `shoal train`, for calibration."""
+    """Settings that override the preset's, as NAME=VALUE: any field of `shoal train`, for calibration."""
     robots: tuple[int, ...] = ROBOTS
     """Robots per group."""
     groups: tuple[int, ...] = GROUPS
     """Group counts."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Training seeds; all cells of the first one are trained before those of the next."""
+    """Training seeds; all cells of a seed are trained before those of the next."""
     env_steps: int | None = None
-    """Env steps of each training; the preset's by default. What falls over the training falls over these."""
+    """Env steps of each training, the preset's by default; schedules are stretched to them."""
     episodes: int = 3_000
     """Fixed: greedy episodes in the setup of the training (3.3: 30 iterations of 100)."""
     extrapolation: Literal["all", "none"] = "all"
-    """Extrapolation: every policy in every other setup that it fits (M_IN, M_OUT: of as many groups), or none."""
+    """Extrapolation: every policy in every other setup that it fits (M_IN, M_OUT: equal group count), or none."""
     extrapolation_episodes: int = 300
     """Extrapolation: greedy episodes in each other setup."""
     baselines: tuple[BaselineName, ...] = ("fl-orca", "greedy")
-    """Rules that need no learning (see `shoal evaluate`), played in every setup as the policies are; may be empty."""
+    """Rules that do not learn (see `shoal evaluate`), evaluated in every setup like the policies; may be empty."""
     baseline_episodes: int = 500
     """Episodes of each baseline in each setup."""
     first_seed: int = 2_000_000_000
-    """Seed of the first evaluated episode; the others count on. Calibration uses others than the evaluation."""
+    """Seed of the first evaluated episode, later ones add 1 each. Calibration uses other seeds than evaluation."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -75,28 +75,34 @@ class SweepConfig:
         for name in ("episodes", "extrapolation_episodes", "baseline_episodes", "env_steps"):
             value = getattr(self, name)
             require(value is None or value >= 1, f"{name} must be at least 1, not {value}")
-        changed_settings(self.set)
+        parse_overrides(self.set)
         most = 2**32 - 1 - max(self.episodes, self.extrapolation_episodes, self.baseline_episodes)
         require(0 <= self.first_seed <= most, f"first_seed must be in 0..{most}, not {self.first_seed}")
 
     @property
     def label(self) -> str:
-        """What the results' column `preset` says: the preset and what was set in its place."""
+        """The results' column `preset`: the preset and its overrides, joined by `+`."""
         return "+".join((self.preset, *self.set))
 
 
-NOT_SET = (
-    "world seed engine device method sources robots groups env_id total_env_steps "
+SET_BY_GRID = (
+    "world seed engine device method method_source scene_source robots groups env_id total_env_steps "
     "final_eval_episodes final_eval_first_seed"
 ).split()
-"""Settings that the grid itself decides."""
+"""Settings that the grid sets itself: no override may name them."""
 
 
-def changed_settings(assignments: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The run's and the world's settings of NAME=VALUE texts; values are those of TOML, names those of the fields.
+def parse_overrides(assignments: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Parses overrides of a preset.
+
+    Args:
+      assignments: NAME=VALUE, with a field's name and a TOML value; a value that is not TOML is a string.
+
+    Returns:
+      Settings of `RunConfig` and settings of `WorldConfig`, by name.
 
     Raises:
-      ConfigError: a text is no assignment, or its name no setting that a sweep leaves free.
+      ConfigError: a text is not an assignment, or names a setting that cannot be overridden.
     """
     run: dict[str, Any] = {}
     world: dict[str, Any] = {}
@@ -104,21 +110,21 @@ def changed_settings(assignments: tuple[str, ...]) -> tuple[dict[str, Any], dict
         name, sign, value = text.partition("=")
         require(bool(sign) and bool(name), f"set takes NAME=VALUE, not {text!r}")
         require(
-            name not in NOT_SET
+            name not in SET_BY_GRID
             and (name in RunConfig.__dataclass_fields__ or name in WorldConfig.__dataclass_fields__),
             f"set cannot change {name!r}; `shoal train --help` lists the settings",
         )
         try:
             parsed = tomllib.loads(f"value = {value}")["value"]
         except tomllib.TOMLDecodeError:
-            parsed = value  # a plain word
-        part = run if name in RunConfig.__dataclass_fields__ else world
-        part[name] = tuple(parsed) if isinstance(parsed, list) else parsed
+            parsed = value  # a bare word
+        settings = run if name in RunConfig.__dataclass_fields__ else world
+        settings[name] = tuple(parsed) if isinstance(parsed, list) else parsed
     return run, world
 
 
 class Cell(NamedTuple):
-    """One training of a sweep, or a baseline in one setup; `key` tells configs apart and names its folder."""
+    """One training of a sweep, or one baseline in one setup; `key` is unique and the name of its folder."""
 
     key: str
     config: RunConfig
@@ -126,30 +132,30 @@ class Cell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What people call it, such as `sensor 10r×2g s0` or `greedy: sensor 10r×2g`."""
+        """Name for users, such as `sensor 10r×2g s0` or `greedy: sensor 10r×2g`."""
         world = self.config.world
         return self.config.name if self.policy == LEARNED else f"{self.policy}: {world.method_name} {world.setup}"
 
     @property
     def weight(self) -> float:
-        """What the cell costs, roughly: env steps x (robots and a part for perception and learning)."""
+        """Estimated relative cost: env steps x (robots + a constant for perception, and in training for learning)."""
         robots, steps = self.config.world.num_robots, self.config.world.horizon_steps * self.config.final_eval_episodes
-        played = steps * (robots + 10.0)
-        return played + (self.config.total_env_steps * (robots + 60.0) if self.policy == LEARNED else 0.0)
+        evaluation = steps * (robots + 10.0)
+        return evaluation + (self.config.total_env_steps * (robots + 60.0) if self.policy == LEARNED else 0.0)
 
 
-FIRST_DEFAULTS = {"steps_per_block": 32, "updates_per_call": 32}
-"""Defaults that have changed since the first results were committed, as they were then."""
+ORIGINAL_DEFAULTS = {"steps_per_block": 32, "updates_per_call": 32}
+"""Original values of the defaults that have changed since the first results were committed."""
 
 
-@functools.lru_cache(maxsize=4096)  # a table of results asks for the same ones after every cell
+@functools.lru_cache(maxsize=4096)  # the table of results needs every cell's hash again after each cell
 def cell_hash(config: RunConfig) -> str:
-    """Twelve hex digits of all that decides a cell's results; unlike `config_hash`, the training's length counts.
+    """Hash of all settings that decide a cell's results, 12 hex digits; unlike `config_hash`, the length counts.
 
-    Only what differs from the first defaults goes in, so that results stay known when a later version has more
-    settings or other defaults. A test holds the presets against the settings of committed results.
+    Only settings that differ from the original defaults are hashed, so that results stay valid when a later version has
+    more settings or other defaults. A test checks the presets against the settings of committed results.
     """
-    defaults = to_dict(RunConfig()) | FIRST_DEFAULTS
+    defaults = to_dict(RunConfig()) | ORIGINAL_DEFAULTS
     given = identity_dict(config)
     world = {name: value for name, value in given["world"].items() if value != defaults["world"][name]}
     run = {name: value for name, value in given.items() if value != defaults[name]}
@@ -163,10 +169,10 @@ def make_cell(sweep: SweepConfig, method: str, robots: int, groups: int, seed: i
     """The cell of one method, setup and seed.
 
     Raises:
-      ConfigError: the setup is not possible.
+      ConfigError: the setup is impossible.
     """
     preset = preset_config(sweep.preset, method, robots, groups)
-    run, world = changed_settings(sweep.set)
+    run, world = parse_overrides(sweep.set)
     env_steps = sweep.env_steps or preset.total_env_steps
     config = dataclasses.replace(
         preset,
@@ -176,11 +182,11 @@ def make_cell(sweep: SweepConfig, method: str, robots: int, groups: int, seed: i
         epsilon_decay_env_steps=max(1, preset.epsilon_decay_env_steps * env_steps // preset.total_env_steps),
         seed=seed,
         engine="process",
-        device="cpu",  # cells share a machine, one a CPU
+        device="cpu",  # cells share a machine, one per CPU
         final_eval_episodes=sweep.episodes,
         final_eval_first_seed=sweep.first_seed,
     )
-    prioritised = run.get("replay") == "prioritised"  # else the default stays, with which cells have their names
+    prioritised = run.get("replay") == "prioritised"  # otherwise the default stays, or cells would change their keys
     scheduled = {"importance_exponent_env_steps": env_steps} if prioritised else {}
     config = dataclasses.replace(config, **{**scheduled, **run})
     name = config.world.method_name
@@ -188,20 +194,20 @@ def make_cell(sweep: SweepConfig, method: str, robots: int, groups: int, seed: i
 
 
 def sweep_of_label(label: str) -> SweepConfig:
-    """A sweep of this label, its grid and its evaluations as by default.
+    """A sweep with this label, and the default grid and evaluations.
 
     Raises:
-      ConfigError: the label is no sweep's.
+      ConfigError: no sweep has this label.
     """
     preset, *changed = label.split("+")
     return SweepConfig(preset=cast(PresetName, preset), set=tuple(changed))
 
 
 def world_of_label(label: str, method: str, robots: int, groups: int) -> WorldConfig:
-    """The world in which a sweep of this label plays.
+    """The world of one method and setup in a sweep with this label.
 
-    Where there is none, because its settings do not fit this method and setup or the label is no sweep's, that of its
-    preset alone, and that of `thesis` at last.
+    Where that is impossible (the overrides do not fit the method and setup, or no sweep has the label), the world of
+    the label's preset without overrides; where that is impossible, too, the world of `thesis`.
     """
     for known in (label, label.split("+")[0]):
         try:
@@ -212,7 +218,7 @@ def world_of_label(label: str, method: str, robots: int, groups: int) -> WorldCo
 
 
 def expected_hash(sweep: SweepConfig, row: ResultRow) -> str | None:
-    """The hash of the cell whose row this would be with the sweep's settings; None if the sweep could not have it."""
+    """Hash of the cell that has the row's method, setup and seed in this sweep; None if no such cell is possible."""
     setup = (row.trained_robots, row.trained_groups)
     known = {short_name(METHODS, method): method for method in sweep.methods}
     try:
@@ -225,22 +231,22 @@ def expected_hash(sweep: SweepConfig, row: ResultRow) -> str | None:
 
 
 def make_cells(sweep: SweepConfig) -> list[Cell]:
-    """All cells: baselines, then seed after seed; of each the cheapest first, so that most results come early.
+    """All cells: baselines, then seed after seed, the cheapest of each first, so that most results are early.
 
     Raises:
-      ConfigError: a setup is not possible.
+      ConfigError: a setup is impossible.
     """
     setups = [(method, r, g) for method in sweep.methods for r in sweep.robots for g in sweep.groups]
-    parts = [[make_baseline_cell(sweep, baseline, *setup) for setup in setups] for baseline in sweep.baselines]
-    parts += [[make_cell(sweep, *setup, seed) for setup in setups] for seed in sweep.seeds]
-    return [cell for part in parts for cell in sorted(part, key=lambda cell: cell.weight)]
+    rounds = [[make_baseline_cell(sweep, baseline, *setup) for setup in setups] for baseline in sweep.baselines]
+    rounds += [[make_cell(sweep, *setup, seed) for setup in setups] for seed in sweep.seeds]
+    return [cell for cells in rounds for cell in sorted(cells, key=lambda cell: cell.weight)]
 
 
 def make_baseline_cell(sweep: SweepConfig, baseline: BaselineName, method: str, robots: int, groups: int) -> Cell:
-    """The cell of a baseline in the world that the preset gives a method in one setup.
+    """The cell of a baseline in the world of a method and setup.
 
     Raises:
-      ConfigError: the setup is not possible.
+      ConfigError: the setup is impossible.
     """
     trained = make_cell(sweep, method, robots, groups, 0).config
     config = dataclasses.replace(trained, final_eval_episodes=sweep.baseline_episodes)
@@ -248,10 +254,10 @@ def make_baseline_cell(sweep: SweepConfig, baseline: BaselineName, method: str, 
     return Cell(f"{baseline}-{name}-{robots}r{groups}g-{cell_hash(config)}", config, baseline)
 
 
-def _other_setups(sweep: SweepConfig, cell: Cell) -> list[tuple[int, int]]:
+def _extrapolation_setups(sweep: SweepConfig, cell: Cell) -> list[tuple[int, int]]:
     """(robots, groups) of the other setups in which a cell's policy is evaluated (Extrapolation).
 
-    Where a method's state depends on the number of groups, as that of M_IN and M_OUT, groups stay.
+    Where the size of a method's state depends on the number of groups (M_IN, M_OUT), that number stays.
     """
     world = cell.config.world
     if sweep.extrapolation == "none" or cell.policy != LEARNED:
@@ -260,28 +266,28 @@ def _other_setups(sweep: SweepConfig, cell: Cell) -> list[tuple[int, int]]:
     return [(r, g) for r in sweep.robots for g in groups if (r, g) != (world.robots, world.groups)]
 
 
-def other_worlds(sweep: SweepConfig, cell: Cell) -> list[WorldConfig]:
+def extrapolation_worlds(sweep: SweepConfig, cell: Cell) -> list[WorldConfig]:
     """The worlds of the other setups in which a cell's policy is evaluated (Extrapolation)."""
     world = cell.config.world
-    return [dataclasses.replace(world, robots=r, groups=g) for r, g in _other_setups(sweep, cell)]
+    return [dataclasses.replace(world, robots=r, groups=g) for r, g in _extrapolation_setups(sweep, cell)]
 
 
-def wanted(sweep: SweepConfig, cell: Cell) -> dict[tuple[int, int], int]:
-    """Episodes that a cell's results must have, by (robots, groups) played in."""
+def wanted_episodes(sweep: SweepConfig, cell: Cell) -> dict[tuple[int, int], int]:
+    """How many episodes a complete cell has in each setup, by (robots, groups)."""
     world, fixed = cell.config.world, cell.config.final_eval_episodes
-    others = dict.fromkeys(_other_setups(sweep, cell), sweep.extrapolation_episodes)
+    others = dict.fromkeys(_extrapolation_setups(sweep, cell), sweep.extrapolation_episodes)
     return {(world.robots, world.groups): fixed} | others
 
 
 def done_cells(sweep: SweepConfig, cells: Iterable[Cell], rows: Iterable[ResultRow]) -> dict[str, list[ResultRow]]:
-    """The results of every cell, by key, that `rows` hold in full; a cell of which they hold a part is left out."""
+    """The results of the cells that are complete in `rows`, by key; others are left out."""
     by_cell: dict[tuple[str, str], dict[tuple[int, int], ResultRow]] = {}
     for row in rows:
         if row.preset == sweep.label:
             by_cell.setdefault((row.policy, row.config), {})[row.robots, row.groups] = row
     done = {}
     for cell in cells:
-        found, need = by_cell.get((cell.policy, cell_hash(cell.config)), {}), wanted(sweep, cell)
-        if all(setup in found and found[setup].episodes >= count for setup, count in need.items()):
-            done[cell.key] = [found[setup] for setup in need]
+        found, wanted = by_cell.get((cell.policy, cell_hash(cell.config)), {}), wanted_episodes(sweep, cell)
+        if all(setup in found and found[setup].episodes >= count for setup, count in wanted.items()):
+            done[cell.key] = [found[setup] for setup in wanted]
     return done

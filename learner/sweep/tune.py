@@ -1,7 +1,7 @@
-"""The module that knows Ray Tune: it schedules a sweep's cells on the CPUs there are, and retries those that crash.
+"""Schedules a sweep's cells on a Ray cluster's CPUs with Ray Tune, and retries those that crash.
 
-Tune owns no checkpoints: a cell resumes from its own. A sweep that goes on is a new Tune experiment of what is
-missing, since Tune cannot change a grid that it restores.
+Tune holds no checkpoints: a cell resumes from its own. A resumed sweep is a new Tune experiment with the missing cells,
+because Tune cannot change the grid of an experiment that it restores.
 """
 
 from __future__ import annotations
@@ -18,35 +18,37 @@ from ray import tune
 
 from learner.ray_backend.cluster import cluster_cpus, connect, leave
 from learner.ray_backend.metrics import RayMetrics
-from learner.sweep.cell import SweepPlace, run_cell
+from learner.sweep.cell import SweepLocation, run_cell
 from learner.sweep.grid import Cell, SweepConfig
 from learner.tracking.journal import Row
 
 ATTEMPTS = 3
-"""How often a cell is started before it counts as failed."""
+"""How often a cell is started at most before it counts as failed."""
 TRACE = "error.txt"
-"""In a failed cell's folder: the trace of its last crash."""
+"""File in a failed cell's folder: the traceback of its last crash."""
 REPORT_EVERY_S = 2.0
-"""Least time between two reports of a cell."""
+"""Minimum time between two reports of a cell."""
 
-os.environ.setdefault("TUNE_DISABLE_AUTO_CALLBACK_LOGGERS", "1")  # cells write their own results
-os.environ.setdefault("RAY_CHDIR_TO_TRIAL_DIR", "0")  # relative paths mean the same in a cell as in the driver
-os.environ.setdefault("TUNE_DISABLE_SIGINT_HANDLER", "1")  # Ctrl-C ends a sweep at once; it can go on at any time
+os.environ.setdefault("TUNE_DISABLE_AUTO_CALLBACK_LOGGERS", "1")  # cells write results themselves
+os.environ.setdefault(
+    "RAY_CHDIR_TO_TRIAL_DIR", "0"
+)  # relative paths are relative to the same folder in a cell and in the driver
+os.environ.setdefault("TUNE_DISABLE_SIGINT_HANDLER", "1")  # Ctrl-C ends a sweep at once: it can be resumed
 
 
 class CellListener(Protocol):
-    """What is told of cells while a sweep runs; every call names the cell by its key."""
+    """Is notified of cells while a sweep runs; every call names the cell by its key."""
 
     def started(self, key: str) -> None:
-        """A cell has begun, perhaps again."""
+        """A cell has started, perhaps again."""
         ...
 
     def progressed(self, key: str, env_steps: int) -> None:
-        """A cell has trained on."""
+        """A cell has trained to `env_steps`."""
         ...
 
     def finished(self, key: str) -> None:
-        """A cell's results are there."""
+        """A cell is done, and its results are written."""
         ...
 
     def failed(self, key: str, reason: str) -> None:
@@ -55,7 +57,7 @@ class CellListener(Protocol):
 
 
 class _Reporter:
-    """Hands a cell's rows to Ray's metrics, and to Tune, not too often."""
+    """Reports a cell's rows to Ray's metrics and, at limited rate, to Tune."""
 
     def __init__(self, key: str) -> None:
         self._metrics = RayMetrics(key)
@@ -69,20 +71,20 @@ class _Reporter:
             tune.report({"env_steps": row.env_steps})
 
 
-def _train_cell(params: dict[str, Any], sweep: SweepConfig, cells: dict[str, Cell], place: SweepPlace) -> None:
+def _train_cell(params: dict[str, Any], sweep: SweepConfig, cells: dict[str, Cell], location: SweepLocation) -> None:
     """Tune's trainable."""
-    run_cell(sweep, cells[params["cell"]], place, _Reporter(params["cell"]))
+    run_cell(sweep, cells[params["cell"]], location, _Reporter(params["cell"]))
 
 
 class _Callback(tune.Callback):
-    """Translates Tune's events to a CellListener, and keeps the trace of a cell's last crash in its folder."""
+    """Passes Tune's events to a CellListener, and writes the traceback of a cell's last crash to its folder."""
 
-    def __init__(self, listener: CellListener, place: SweepPlace) -> None:
+    def __init__(self, listener: CellListener, location: SweepLocation) -> None:
         self._listener = listener
-        self._place = place
+        self._location = location
 
     def __getstate__(self) -> dict[str, Any]:
-        """Nothing: Tune saves its experiment with its callbacks, which here is never restored."""
+        """Nothing: Tune pickles its callbacks with its experiment, which is never restored here."""
         return {}
 
     def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
@@ -101,7 +103,7 @@ class _Callback(tune.Callback):
         if trial.status != "ERROR":
             return
         key, trace = trial.config["cell"], str(trial.get_error() or "its process died")
-        path = self._place.cells / key / TRACE
+        path = self._location.cells / key / TRACE
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(trace + "\n")
         lines = [line for line in trace.splitlines() if line.strip()]
@@ -111,7 +113,7 @@ class _Callback(tune.Callback):
 def run_cells(
     sweep: SweepConfig,
     cells: list[Cell],
-    place: SweepPlace,
+    location: SweepLocation,
     address: str | None,
     at_once: int | None,
     listener: CellListener,
@@ -121,18 +123,18 @@ def run_cells(
     Args:
       sweep: the sweep.
       cells: those of its cells that are to run, in order.
-      place: where they lie; all nodes must see it.
-      address: Ray cluster, None for a Ray of its own on this machine.
-      at_once: cells at once at the most, None for one a CPU.
-      listener: is told what happens.
+      location: where they are stored and logged; every node must be able to access it.
+      address: address of a Ray cluster, None for a Ray of its own on this machine.
+      at_once: how many cells run at once at most, None for one per CPU.
+      listener: is notified of the cells.
 
     Raises:
       ConfigError: see `learner.ray_backend.cluster.connect`.
     """
     connect(1, address)
     known = {cell.key: cell for cell in cells}
-    at_once = at_once or cluster_cpus()  # without a limit Tune would take the cells in no order
-    trainable = tune.with_parameters(_train_cell, sweep=sweep, cells=known, place=place)
+    at_once = at_once or cluster_cpus()  # without a limit, Tune would not keep the order of the cells
+    trainable = tune.with_parameters(_train_cell, sweep=sweep, cells=known, location=location)
     with tempfile.TemporaryDirectory(prefix="shoal-tune-") as folder:
         tuner = tune.Tuner(
             tune.with_resources(trainable, {"cpu": 1}),
@@ -142,10 +144,10 @@ def run_cells(
                 name="cells",
                 storage_path=str(Path(folder)),
                 failure_config=tune.FailureConfig(max_failures=ATTEMPTS - 1),
-                callbacks=[_Callback(listener, place)],
+                callbacks=[_Callback(listener, location)],
                 verbose=0,
             ),
         )
-        with redirect_stdout(io.StringIO()):  # the listener tells what Tune would print
+        with redirect_stdout(io.StringIO()):  # the listener shows what Tune would print
             tuner.fit()
     leave()

@@ -1,4 +1,4 @@
-"""The run's faults as a file of JSON lines: what failed, what was done about it, and when it worked again."""
+"""The log of faults, a file of JSON lines: what failed, what was done about it, and when it recovered."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ Event = Literal["failed", "mended", "resumed"]
 
 
 class FaultEntry(NamedTuple):
-    """One event: wall time, what happened to which part, and with `mended` how long the part was out."""
+    """One event of a component: wall time in s since the epoch, and for `mended` how many seconds the outage took.
+
+    `attempts` counts the component's failures in a row.
+    """
 
     time_s: float
     event: Event
-    part: str
+    component: str
     fault: str
     action: str
     attempts: int
@@ -26,7 +29,7 @@ class FaultEntry(NamedTuple):
 
 
 class FaultLog:
-    """Appends to the file, one write a line.
+    """Appends to the file, each line in one write.
 
     Args:
       path: the file.
@@ -36,27 +39,27 @@ class FaultLog:
         self._path = path
 
     def failed(self, failure: ComponentFailed, decision: Decision) -> None:
-        """Notes a failure and the decision about it."""
+        """Records a failure and the decision about it."""
         self._append("failed", str(failure.component), failure.fault, decision.action, decision.attempts, 0.0)
 
     def recovered(self, recovered: Recovered) -> None:
-        """Notes that a component works again; the event's name on disk is `mended`."""
+        """Records that a component has recovered; the event is called `mended` on disk."""
         component, fault, action, attempts, seconds = recovered
         self._append("mended", str(component), fault, action, attempts, seconds)
 
     def resumed(self) -> None:
-        """Notes that another driver goes on with the run."""
+        """Records that a new driver has resumed the run."""
         self._append("resumed", DRIVER, "died", "resume", 1, 0.0)
 
-    def _append(self, event: Event, part: str, fault: str, action: str, attempts: int, seconds: float) -> None:
-        entry = FaultEntry(time.time(), event, part, str(fault), str(action), attempts, seconds)
+    def _append(self, event: Event, component: str, fault: str, action: str, attempts: int, seconds: float) -> None:
+        entry = FaultEntry(time.time(), event, component, str(fault), str(action), attempts, seconds)
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with self._path.open("a") as file:
             file.write(json.dumps(entry) + "\n")
 
 
 def read_faults(path: Path) -> list[FaultEntry]:
-    """All entries; half a line at the end, of a driver that was killed, does not count."""
+    """All entries; a half-written line of a killed driver is skipped."""
     try:
         lines = path.read_text().split("\n")[:-1]
     except OSError:
@@ -66,5 +69,5 @@ def read_faults(path: Path) -> list[FaultEntry]:
         try:
             entries.append(FaultEntry(*json.loads(line)))
         except ValueError:
-            continue  # a killed driver's half line with the next driver's first behind it
+            continue  # a killed driver's half-written line, with the next driver's first line appended
     return entries

@@ -1,7 +1,7 @@
-"""The run's metrics as a local file, whose length a checkpoint knows.
+"""The journal: a run's metrics in a local file, the source that MLflow mirrors.
 
-MLflow is a mirror of it: rows are pushed once a checkpoint covers them, with the time they were made, so
-that a row that is pushed twice is stored once, and a resumed run neither repeats nor misses a step.
+A checkpoint holds the journal's length. Rows are pushed to MLflow once a checkpoint covers them, each with the time at
+which it was measured. So a row that is pushed twice is stored once, and a resumed run neither repeats nor misses a row.
 """
 
 from __future__ import annotations
@@ -11,13 +11,14 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
+from actors.storage.atomic_write import replacing_file
 from sim_core.checks import ConfigError
 
 ACCOUNT = "account/"
-"""Begins the names of counts since the start of the run."""
+"""Prefix of metrics that count since the start of the run."""
 FINAL = "final/"
-"""Begins the names of a run's results."""
-_FOR_MONITORING = (
+"""Prefix of the metrics of a run's result."""
+_MONITORING_ONLY = (
     "replay/size",
     "policy/staleness_s",
     "train/td_error",
@@ -30,25 +31,25 @@ _FOR_MONITORING = (
     "system/cpu_utilization_percentage",
 )
 _WITH_INTERVAL = ("final/success_rate", "final/return")
-_ENDS = ("_low", "_high")
+_INTERVAL_ENDS = ("_low", "_high")
 
 
-def charted(metrics: dict[str, float]) -> dict[str, float]:
-    """What of a row goes to MLflow, whose charts want few keys (under 30 of a run).
+def mlflow_metrics(metrics: dict[str, float]) -> dict[str, float]:
+    """The metrics of a row that MLflow gets: fewer than 30 names a run, since its UI draws a chart for each.
 
-    Not the accounts nor what only monitoring asks for, and of the intervals that of the result alone.
+    Left out are the accounts, what only monitoring needs, and all confidence intervals but those of the result.
     """
-    return {name: value for name, value in metrics.items() if _is_charted(name)}
+    return {name: value for name, value in metrics.items() if _is_for_mlflow(name)}
 
 
-def _is_charted(name: str) -> bool:
-    if name.endswith(_ENDS):
+def _is_for_mlflow(name: str) -> bool:
+    if name.endswith(_INTERVAL_ENDS):
         return name.startswith(_WITH_INTERVAL)
-    return not name.startswith(ACCOUNT) and name not in _FOR_MONITORING
+    return not name.startswith(ACCOUNT) and name not in _MONITORING_ONLY
 
 
 class Row(NamedTuple):
-    """Metrics of one moment: env steps, wall time in milliseconds, values by name."""
+    """Metrics measured at one time: env steps, wall time in ms since the epoch, values by name."""
 
     env_steps: int
     time_ms: int
@@ -56,11 +57,11 @@ class Row(NamedTuple):
 
 
 class Journal:
-    """Append-only rows in a file of JSON lines.
+    """An append-only file of rows, one JSON line each.
 
     Args:
-      path: the file.
-      offset: bytes that count; what a crashed run wrote after them is cut off.
+      path: the file; made if missing.
+      offset: length in bytes that the checkpoint covers; the file is truncated to it.
 
     Raises:
       ConfigError: the file is shorter than `offset`.
@@ -74,19 +75,19 @@ class Journal:
         if length < offset:
             self._file.close()
             raise ConfigError(
-                f"{path} has {length} bytes, its checkpoint knows {offset}: put the whole file back or train anew"
+                f"{path} has {length} bytes, its checkpoint needs {offset}: restore the whole file or start a new run"
             )
         self._file.truncate(offset)
         self._file.seek(offset)
 
     def append(self, row: Row) -> None:
-        """Writes one row, at once, so that whoever looks into a run sees it; `sync` makes it durable."""
+        """Writes a row, visible to other processes at once; `sync` makes it durable."""
         self._file.write(json.dumps(row).encode() + b"\n")
         self._file.flush()
 
     @property
     def length(self) -> int:
-        """Bytes of all rows so far."""
+        """Length of the file in bytes."""
         return self._file.tell()
 
     def sync(self) -> int:
@@ -96,7 +97,7 @@ class Journal:
         return self._file.tell()
 
     def rows(self, start: int = 0, end: int | None = None) -> list[Row]:
-        """The rows from byte `start` on, up to byte `end`; any thread may ask."""
+        """The rows from byte `start` up to byte `end`, or the end of the file; callable from any thread."""
         self._file.flush()
         with self._path.open("rb") as file:
             file.seek(start)
@@ -109,26 +110,26 @@ class Journal:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The whole rows of a journal that another process may be writing; none where there is no journal yet.
+    """The rows of a journal that another process may be writing, but a half-written last one; none without a file.
 
     Raises:
-      ConfigError: the file cannot be read or holds something else.
+      ConfigError: the file cannot be read or is not a journal.
     """
     try:
-        lines = path.read_bytes().split(b"\n")[:-1]  # the last one may be unfinished
+        lines = path.read_bytes().split(b"\n")[:-1]  # the last one may be half written
         return [Row(*json.loads(line)) for line in lines]
     except FileNotFoundError:
         return []
     except (OSError, ValueError, TypeError) as error:
-        raise ConfigError(f"the metrics {path} cannot be read ({error}); put the whole file back") from error
+        raise ConfigError(f"the metrics {path} cannot be read ({error}); restore the whole file") from error
 
 
 class PushedMark:
-    """Remembers over restarts up to which byte the journal was pushed; a crash before the note only pushes twice.
+    """A file that remembers how many bytes of the journal MLflow has; after a crash, rows are at worst pushed again.
 
     Args:
-      path: the file that holds the number.
-      limit: length of the journal now; a mark beyond it does not count.
+      path: the file.
+      limit: the journal's length; a larger mark is lowered to it.
     """
 
     def __init__(self, path: Path, limit: int) -> None:
@@ -137,18 +138,17 @@ class PushedMark:
 
     @staticmethod
     def value(path: Path) -> int:
-        """The byte that the file `path` notes; 0 where nothing is noted."""
+        """The mark in the file `path`, in bytes; 0 if there is none."""
         try:
             return int(path.read_text())
         except (OSError, ValueError):
             return 0
 
     def read(self) -> int:
-        """The byte; 0 where nothing is noted."""
+        """The mark in bytes; 0 if there is none."""
         return self.value(self._path)
 
     def write(self, offset: int) -> None:
-        """Notes a byte."""
-        part = self._path.with_suffix(".part")
-        part.write_text(str(offset))
-        part.replace(self._path)
+        """Sets the mark."""
+        with replacing_file(self._path) as partial:
+            partial.write_text(str(offset))

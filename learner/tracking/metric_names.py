@@ -1,7 +1,7 @@
-"""Every metric of a run under the name that Prometheus knows it by: one table, for code, dashboards and docs.
+"""The table of all metrics that Prometheus gets: their names, units and meanings, for code, dashboards and docs.
 
-The journal's rows are the only measurement; `ray_metrics` passes them on under these names. Ray puts `ray_` before each
-and Prometheus' `_total` behind a counter.
+Metrics are measured once, in the journal's rows; `learner.ray_backend.metrics` exports the rows under these names. Ray
+adds the prefix `ray_`, and the suffix `_total` to counters.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 ENV_STEPS = "env_steps"
-"""Stands for a training row's own count of env steps."""
+"""In place of a journal name: the row's own count of env steps."""
 
 
-class Exported(NamedTuple):
-    """One metric: its name in the journal and in Ray, its kind, and what the operator's page says of it."""
+class MetricSpec(NamedTuple):
+    """One metric: its names in the journal and in Ray, its kind, and its row in learner/README.md."""
 
     journal: str
     name: str
@@ -24,51 +24,57 @@ class Exported(NamedTuple):
 
     @property
     def series(self) -> str:
-        """The name that queries use."""
+        """Its name in Prometheus queries."""
         return f"ray_{self.name}_total" if self.kind == "counter" else f"ray_{self.name}"
 
 
-def _gauge(journal: str, name: str, unit: str, meaning: str, healthy: str) -> Exported:
-    return Exported(journal, f"shoal_{name}", "gauge", unit, meaning, healthy)
+def _gauge(journal: str, name: str, unit: str, meaning: str, healthy: str) -> MetricSpec:
+    return MetricSpec(journal, f"shoal_{name}", "gauge", unit, meaning, healthy)
 
 
-def _counter(journal: str, name: str, unit: str, meaning: str, healthy: str) -> Exported:
-    return Exported(journal, f"shoal_{name}", "counter", unit, meaning, healthy)
+def _counter(journal: str, name: str, unit: str, meaning: str, healthy: str) -> MetricSpec:
+    return MetricSpec(journal, f"shoal_{name}", "counter", unit, meaning, healthy)
 
 
 THROUGHPUT = (
-    _counter(ENV_STEPS, "env_steps", "env steps", "made by the run, those before a resume included", "grows"),
-    _counter("account/updates", "updates", "updates", "made by the run, those before a resume included", "grows"),
-    _counter("account/episodes", "episodes", "episodes", "that ended in training", "grows"),
-    _gauge("speed/env_steps_per_s", "env_steps_per_second", "env steps/s", "since the last row", "steady"),
-    _gauge("speed/updates_per_s", "updates_per_second", "updates/s", "since the last row", "steady"),
+    _counter(ENV_STEPS, "env_steps", "env steps", "of the run so far, before and after resumes", "grows"),
+    _counter("account/updates", "updates", "updates", "of the run so far, before and after resumes", "grows"),
+    _counter("account/episodes", "episodes", "episodes", "training episodes that have ended", "grows"),
+    _gauge("speed/env_steps_per_s", "env_steps_per_second", "env steps/s", "mean since the last row", "steady"),
+    _gauge("speed/updates_per_s", "updates_per_second", "updates/s", "mean since the last row", "steady"),
 )
 
 LEARNING = (
-    _gauge("train/epsilon", "epsilon", "share", "exploration rate of the last block", "falls to `epsilon_end`"),
+    _gauge("train/epsilon", "epsilon", "share", "exploration rate of the newest block", "falls to `epsilon_end`"),
     _gauge(
         "train/success_rate",
         "train_success_rate",
         "share",
-        "training episodes since the last row that ended in the goal",
-        "rises, below the evaluated one while epsilon is large",
+        "training episodes since the last row that reached the goal",
+        "rises; below the evaluated rate while epsilon is large",
     ),
-    _gauge("train/return", "train_return", "reward", "mean return of those episodes", "rises"),
-    _gauge("train/episode_length", "train_episode_length", "env steps", "their mean length", "below the horizon"),
-    _gauge("train/loss", "loss", "squared reward", "mean Huber loss", "small, without growth"),
-    _gauge("train/td_error", "td_error", "reward", "mean absolute TD error", "small, without growth"),
-    _gauge("train/q_mean", "q_mean", "reward", "mean action value in the minibatches", "bounded by the best return"),
+    _gauge("train/return", "train_return", "reward", "mean return of training episodes since the last row", "rises"),
+    _gauge(
+        "train/episode_length",
+        "train_episode_length",
+        "env steps",
+        "mean length of training episodes since the last row",
+        "below the horizon",
+    ),
+    _gauge("train/loss", "loss", "squared reward", "mean loss of the updates", "small, not growing"),
+    _gauge("train/td_error", "td_error", "reward", "mean absolute TD error", "small, not growing"),
+    _gauge("train/q_mean", "q_mean", "reward", "mean action value in the batches", "bounded by the best return"),
 )
 
 
-def _evaluated() -> tuple[Exported, ...]:
+def _evaluated() -> tuple[MetricSpec, ...]:
     ends = {"low": "lower end of its 95 % interval", "high": "upper end of its 95 % interval"}
     rates = {
-        "success": ("greedy episodes on fixed seeds that ended in the goal", "rises"),
-        "lost": ("of them lost", "falls"),
-        "captured": ("of them captured", "falls"),
-        "collision": ("of them collided", "falls"),
-        "timeout": ("of them at the horizon", "falls"),
+        "success": ("greedy episodes on fixed seeds that reached the goal", "rises"),
+        "lost": ("greedy episodes in which the robot was lost", "falls"),
+        "captured": ("greedy episodes in which the robot was captured", "falls"),
+        "collision": ("greedy episodes that ended in a collision", "falls"),
+        "timeout": ("greedy episodes that ended at the horizon", "falls"),
     }
     rows = []
     for name, (meaning, healthy) in rates.items():
@@ -77,19 +83,20 @@ def _evaluated() -> tuple[Exported, ...]:
             _gauge(f"eval/{name}_rate_{end}", f"eval_{name}_rate_{end}", "share", text, "")
             for end, text in ends.items()
         ]
-    rows.append(_gauge("eval/return", "eval_return", "reward", "mean return of the evaluated episodes", "rises"))
+    rows.append(_gauge("eval/return", "eval_return", "reward", "mean return of the greedy episodes", "rises"))
     rows += [
         _gauge(f"eval/return_{end}", f"eval_return_{end}", "reward", f"{text}, in environments without outcomes", "")
         for end, text in ends.items()
     ]
-    length = _gauge("eval/episode_length", "eval_episode_length", "env steps", "their mean length", "below the horizon")
+    meaning = "mean length of the greedy episodes"
+    length = _gauge("eval/episode_length", "eval_episode_length", "env steps", meaning, "below the horizon")
     return (*rows, length)
 
 
 EVALUATION = _evaluated()
 
 REPLAY = (
-    _gauge("replay/size", "replay_size", "transitions", "held by all shards together", "grows to `replay_capacity`"),
+    _gauge("replay/size", "replay_size", "transitions", "stored in all shards together", "grows to `replay_capacity`"),
     _gauge(
         "replay/samples_per_insert",
         "samples_per_insert",
@@ -108,7 +115,7 @@ REPLAY = (
         "policy/staleness_s",
         "broadcast_lag_seconds",
         "s",
-        "the same in seconds, clocks of two nodes compared",
+        "the same age in seconds, by the clocks of two nodes",
         "a few seconds",
     ),
     _counter(
@@ -116,24 +123,24 @@ REPLAY = (
         "waits_to_insert",
         "rounds",
         "of the loop in which a rollout worker had to wait for the learner",
-        "grows where the learner is the slower side",
+        "grows if the learner is the slower side",
     ),
     _counter(
         "account/waits_to_sample",
         "waits_to_sample",
         "rounds",
         "of the loop in which the learner had to wait for transitions",
-        "grows where the rollout workers are the slower side",
+        "grows if the rollout workers are the slower side",
     ),
 )
 
 
-def _share(part: str, does: str, meaning: str, healthy: str) -> Exported:
-    name = f"{part.split()[-1]}_{does}"
-    return _gauge(f"time/{name}", f"time_{name}", "share", f"of the {part}'s time: {meaning}", healthy)
+def _share(component: str, activity: str, meaning: str, healthy: str) -> MetricSpec:
+    name = f"{component.split()[-1]}_{activity}"
+    return _gauge(f"time/{name}", f"time_{name}", "share", f"of the {component}'s time: {meaning}", healthy)
 
 
-_LIMITS = "high where it limits the run"
+_LIMITS = "high if it limits the run"
 _WAITS = "waiting for the training loop, and for checkpoints"
 TIMES = (
     _share("rollout worker", "acts", "stepping environments", _LIMITS),
@@ -142,26 +149,26 @@ TIMES = (
         "rollout worker",
         "waits",
         _WAITS,
-        "high where the learner limits the run",
+        "high if the learner limits the run",
     ),
     _share("learner", "updates", "making updates", _LIMITS),
-    _share("learner", "samples", "drawing transitions, or waiting for shards", "small"),
-    _share("learner", "publishes", "handing out weights and TD errors", "small"),
-    _share("learner", "stores", "storing the rollout workers' blocks, where the shards are its own", "small"),
+    _share("learner", "samples", "sampling transitions, or waiting for shards", "small"),
+    _share("learner", "publishes", "publishing weights and TD errors", "small"),
+    _share("learner", "stores", "storing the rollout workers' blocks, where it holds the shards", "small"),
     _share(
         "learner",
         "waits",
         _WAITS,
-        "high where the rollout workers limit the run",
+        "high if the rollout workers limit the run",
     ),
 )
 
-# Ray shows a counter once it counts: what should stay 0 is a gauge.
+# Ray exports a counter only once it is above 0. What should stay 0 is therefore a gauge.
 ACCOUNTS = (
     _counter("account/produced", "transitions_produced", "transitions", "made by rollout workers", "stored + dropped"),
     _counter("account/stored", "transitions_stored", "transitions", "stored by replay shards", "grows"),
-    _gauge("account/dropped", "transitions_dropped", "transitions", "lost with a part, or that came twice", "0"),
-    _counter("account/sampled", "transitions_sampled", "transitions", "drawn for updates", "updates x `batch_size`"),
+    _gauge("account/dropped", "transitions_dropped", "transitions", "lost with a component, or received twice", "0"),
+    _counter("account/sampled", "transitions_sampled", "transitions", "sampled for updates", "updates x `batch_size`"),
 )
 
 HEALTH = (
@@ -171,5 +178,5 @@ HEALTH = (
     ),
 )
 
-METRICS: tuple[Exported, ...] = (*THROUGHPUT, *LEARNING, *EVALUATION, *REPLAY, *TIMES, *ACCOUNTS, *HEALTH)
-"""All of them, in the order of the operator's page."""
+METRICS: tuple[MetricSpec, ...] = (*THROUGHPUT, *LEARNING, *EVALUATION, *REPLAY, *TIMES, *ACCOUNTS, *HEALTH)
+"""All metrics, in the order of the table in learner/README.md."""

@@ -1,4 +1,4 @@
-"""What MLflow holds of a run: read back to compare it with the journal."""
+"""Reads a run's metrics back from MLflow, to compare them with the journal."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from learner.tracking.mlflow_run import mlflow_client
 
 
 class MetricValue(NamedTuple):
-    """One value of a metric."""
+    """One value of a metric; `time_ms` is in ms since the epoch."""
 
     time_ms: int
     env_steps: int
@@ -17,7 +17,7 @@ class MetricValue(NamedTuple):
 
 
 class MlflowHistory:
-    """A run in MLflow, read only.
+    """Reads a run in MLflow.
 
     Args:
       identity: the run.

@@ -1,7 +1,7 @@
-"""What a run takes from and gives to MLflow beside metrics: its episodes as datasets, its policy in the model registry.
+"""A run's episodes as MLflow datasets, and its policy in MLflow's model registry.
 
-One registered model a setup, such as `sensor-10r-2g`, whose versions are the policies of its finished runs; the
-alias `best` is on the one that scored highest.
+Each setup has one registered model, such as `sensor-10r-2g`. Its versions are the policies of finished runs; the alias
+`best` names the one with the highest score.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from learner.config import RunConfig, config_hash
 BEST = "best"
 """Alias of the version with the highest score."""
 SCORE = "score"
-"""Tag of a version: success rate or, where episodes have no outcome, mean return of the run's last evaluation."""
+"""Tag of a version: success rate of the run's final evaluation; mean return where episodes have no outcome."""
 
 
 def model_name(config: RunConfig) -> str:
-    """Name of the registered model of a run's setup."""
+    """Name of the registered model for a run's setup."""
     world = config.world
     return (
         f"{world.method_name}-{world.robots}r-{world.groups}g"
@@ -37,28 +37,27 @@ def model_name(config: RunConfig) -> str:
 
 
 def register_policy(client: MlflowClient, config: RunConfig, run_id: str, logged: ModelInfo, score: float) -> None:
-    """Makes a run's logged model a version of its setup's; one that the run has already stays as it is.
+    """Registers a run's logged model as a version of its setup's model, unless the run has a version already.
 
     Args:
-      client: of the store.
-      config: the run.
-      run_id: its MLflow run.
-      logged: the model.
-      score: what versions are compared by.
+      client: client of the store.
+      config: the run's config.
+      run_id: id of its MLflow run.
+      logged: its logged model.
+      score: by which versions are ranked.
     """
     name = model_name(config)
-    _make_model(client, name)
+    _ensure_model(client, name)
     versions: list[ModelVersion] = list(client.search_model_versions(f"name = '{name}'"))
     if all(version.run_id != run_id for version in versions):
         tags = {SCORE: repr(float(score)), "config_hash": config_hash(config), "seed": str(config.seed)}
-        made = client.create_model_version(name, logged.model_uri, run_id, tags, model_id=logged.model_id)
-        versions.append(made)
+        versions.append(client.create_model_version(name, logged.model_uri, run_id, tags, model_id=logged.model_id))
     ranked = [version for version in versions if SCORE in version.tags]
     best = max(ranked, key=lambda version: (float(version.tags[SCORE]), -int(version.version)))
     client.set_registered_model_alias(name, BEST, best.version)
 
 
-def _make_model(client: MlflowClient, name: str) -> None:
+def _ensure_model(client: MlflowClient, name: str) -> None:
     try:
         client.create_registered_model(name)
     except MlflowException as error:
@@ -67,13 +66,13 @@ def _make_model(client: MlflowClient, name: str) -> None:
 
 
 def dataset_inputs(config: RunConfig, commit: str) -> list[DatasetInput]:
-    """The episodes that a run learns from, and those that its result is measured on.
+    """The episodes that a run learns from, and those of its final evaluation, as MLflow datasets.
 
-    Two runs share a dataset if they play the same worlds under the same seeds.
+    Two runs share a dataset if they play the same worlds with the same seeds.
 
     Args:
-      config: the run.
-      commit: that of the code which makes the episodes.
+      config: the run's config.
+      commit: commit of the simulator's code.
     """
     evaluation = {"first_seed": config.final_eval_first_seed, "episodes": config.final_eval_episodes}
     return [

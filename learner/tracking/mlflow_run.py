@@ -1,4 +1,4 @@
-"""The MLflow side of a run: one client with an explicit run id, in the driver alone."""
+"""A run in MLflow, written by the driver alone: one client, and an explicit run id in every call."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from actors.rollout.vector_env import EnvShape
 from actors.service.fault_policy import first_line
 from learner.config import RunConfig, config_hash, flat_params, user_files
 from learner.file_names import USER_FILES
-from learner.tracking.journal import FINAL, Row, charted
+from learner.tracking.journal import FINAL, Row, mlflow_metrics
 from learner.tracking.mlflow_views import TAG, packed_view, sweep_views
 from learner.tracking.redaction import hide_secrets, public_uri
 from sim_core.checks import ConfigError
@@ -43,24 +43,24 @@ from sqlalchemy.exc import SQLAlchemyError  # noqa: E402
 
 from learner.tracking.mlflow_registry import dataset_inputs, register_policy  # noqa: E402
 
-TROUBLE = (MlflowException, SQLAlchemyError, RequestException)
-"""What MLflow's client raises when its store does not do what it should."""
-PATIENCE_S = 600.0
+MLFLOW_ERRORS = (MlflowException, SQLAlchemyError, RequestException)
+"""What MLflow's client raises when its store fails."""
+SERVER_TIMEOUT_S = 600.0
 """How long a finished run waits for a server that does not answer."""
 MAX_BATCH = 900
-"""Metrics of one request; MLflow takes at most 1,000."""
+"""Metrics in one request; MLflow accepts at most 1,000."""
 CONNECT_TIMEOUT_S = 5.0
 
 
 def check_reachable(uri: str) -> None:
-    """Raises ConfigError unless a server answers where `uri` is an address; local stores pass."""
+    """Raises ConfigError if `uri` is an HTTP address and no server answers there; other stores pass."""
     try:
         parts = urlsplit(uri)
         if parts.scheme not in ("http", "https"):
             return
         port = parts.port or (443 if parts.scheme == "https" else 80)
         socket.create_connection((parts.hostname or "", port), CONNECT_TIMEOUT_S).close()
-    except (OSError, ValueError) as error:  # ValueError: no address at all
+    except (OSError, ValueError) as error:  # ValueError: not an address
         raise ConfigError(
             f"no MLflow server answers at {public_uri(uri)} ({error}); start one with `mlflow server`, "
             "or leave --tracking-uri out to log to a local file"
@@ -68,7 +68,7 @@ def check_reachable(uri: str) -> None:
 
 
 def mlflow_client(uri: str) -> mlflow.MlflowClient:
-    """A client of the store at `uri`, with MLflow's own chatter silenced."""
+    """A client of the store at `uri`; silences MLflow's own log messages."""
     logging.getLogger("mlflow").setLevel(logging.ERROR)
     logging.getLogger("alembic").setLevel(logging.ERROR)
     return mlflow.MlflowClient(uri)
@@ -79,8 +79,8 @@ class Tracker:
 
     Args:
       uri: tracking URI.
-      experiment: experiment name; made if missing.
-      artifact_root: where a new experiment's artifacts go, None for the server's choice.
+      experiment: experiment name; created if missing.
+      artifact_root: where a new experiment stores its artifacts, None for the server's default.
 
     Raises:
       ConfigError: the store cannot be opened.
@@ -91,7 +91,7 @@ class Tracker:
         self.uri = uri
         self.run_id = ""
         self.started_ms = 0
-        """When the run began."""
+        """Start of the run in ms since the epoch."""
         self._logged: set[tuple[str, int]] = set()
         try:
             self._client = mlflow_client(uri)
@@ -106,17 +106,22 @@ class Tracker:
             ) from error
 
     @property
-    def patience_s(self) -> float:
-        """How long to try what the store does not take: a server may come back, a file does not."""
-        return PATIENCE_S if self.uri.startswith(("http:", "https:")) else 0.0
+    def retry_timeout_s(self) -> float:
+        """How long to retry a failed call: a server may come back, a local store will not."""
+        return SERVER_TIMEOUT_S if self.uri.startswith(("http:", "https:")) else 0.0
 
     @cached_property
     def _commit(self) -> str:
         return git_commit()
 
     def start(self, config: RunConfig, tags: dict[str, str] | None = None) -> None:
-        """Creates the run, with the whole config as params and, with `tags`, what a user filters by as tags."""
-        known = {
+        """Creates the run with the whole config as params.
+
+        Args:
+          config: the run's config.
+          tags: further tags, beside those of the config that a user filters by.
+        """
+        config_tags = {
             "method": config.world.method_name if config.env.is_swarm else "none",
             "robots": str(config.world.robots),
             "groups": str(config.world.groups),
@@ -125,12 +130,14 @@ class Tracker:
             "config_hash": config_hash(config),
             "mlflow.source.git.commit": self._commit,
         }
-        run = self._client.create_run(self._experiment_id, tags={"mlflow.runName": config.name} | known | (tags or {}))
+        run = self._client.create_run(
+            self._experiment_id, tags={"mlflow.runName": config.name} | config_tags | (tags or {})
+        )
         self.run_id, self.started_ms = run.info.run_id, run.info.start_time
         self.log_inputs(config)
 
     def log_inputs(self, config: RunConfig) -> None:
-        """Logs the whole config and the episodes it names; what the run has already must be the same."""
+        """Logs the whole config with a user's own files, and the episodes it names; harmless to repeat."""
         params = [Param(key, _param_text(key, value)) for key, value in flat_params(config).items()]
         self._client.log_batch(self.run_id, params=params)
         for name, text in user_files(config).items():
@@ -138,7 +145,7 @@ class Tracker:
         self._client.log_inputs(self.run_id, datasets=dataset_inputs(config, self._commit))
 
     def find_run(self, tags: dict[str, str]) -> str | None:
-        """Id of the experiment's oldest run that has all `tags`; None if there is none."""
+        """Id of the experiment's oldest run with all `tags`; None if there is none."""
         has_all = " and ".join(f"tags.`{name}` = '{value}'" for name, value in tags.items())
         found = self._client.search_runs(
             [self._experiment_id], has_all, max_results=1, order_by=["attributes.start_time ASC"]
@@ -146,14 +153,14 @@ class Tracker:
         return found[0].info.run_id if found else None
 
     def is_finished(self, run_id: str) -> bool:
-        """Whether the store knows a run as finished."""
+        """Whether the run's status in the store is FINISHED."""
         try:
             return bool(self._client.get_run(run_id).info.status == "FINISHED")
         except MlflowException:
             return False
 
     def resume(self, run_id: str) -> None:
-        """Continues an existing run.
+        """Continues an existing run; its tag `attempts` counts the run's sessions.
 
         Raises:
           ConfigError: the store does not know it.
@@ -169,34 +176,39 @@ class Tracker:
             ) from error
         self.run_id, self.started_ms = run_id, run.info.start_time
 
-    def skip_what_is_logged(self) -> None:
-        """Lets `push` leave out every metric at a step at which the run has it already."""
+    def skip_logged_metrics(self) -> None:
+        """Makes `push` skip each value whose metric the run already has at the same step."""
         for key in self._client.get_run(self.run_id).data.metrics:
             self._logged |= {(key, metric.step) for metric in self._client.get_metric_history(self.run_id, key)}
 
     def push(self, rows: list[Row]) -> None:
-        """Mirrors journal rows without their accounts; a row that is there already is stored once."""
+        """Logs journal rows (see `mlflow_metrics`); a row that is pushed twice is stored once."""
         metrics = [
             Metric(key, value, row.time_ms, row.env_steps)
             for row in rows
-            for key, value in charted(row.metrics).items()
+            for key, value in mlflow_metrics(row.metrics).items()
             if math.isfinite(value) and (key, row.env_steps) not in self._logged
         ]
         for start in range(0, len(metrics), MAX_BATCH):
             self._client.log_batch(self.run_id, metrics=metrics[start : start + MAX_BATCH])
 
-    def final(self, metrics: dict[str, float], time_ms: int) -> None:
-        """Logs the run's results at step 0, where the UI draws them as bars; the same of the same time only once."""
+    def log_results(self, metrics: dict[str, float], time_ms: int) -> None:
+        """Logs the run's results at step 0, where the UI draws them as bars.
+
+        Args:
+          metrics: the results, without the prefix `final/`.
+          time_ms: when they were measured; results that are logged twice with the same time are stored once.
+        """
         self.push([Row(0, time_ms, {f"{FINAL}{key}": value for key, value in metrics.items()})])
 
     def log_policy(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape, score: float) -> None:
-        """Logs and registers the greedy policy's Q-network, a model from observations to action values.
+        """Logs and registers the greedy policy's Q-network, a model that maps observations to action values.
 
         Args:
-          weights: of the policy.
-          config: the run.
-          shape: its environments'.
-          score: what the registry compares the policies of a setup by.
+          weights: the policy's weights.
+          config: the run's config.
+          shape: shape of its environment.
+          score: by which the registry ranks the policies of a setup.
         """
         network = QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions)
         load_snapshot(network, weights)
@@ -205,7 +217,7 @@ class Tracker:
             values = network(torch.from_numpy(example)).numpy()
         mlflow.set_tracking_uri(self.uri)
         with warnings.catch_warnings(), mlflow.start_run(run_id=self.run_id):
-            warnings.simplefilter("ignore")  # MLflow's own, about its schema inference
+            warnings.simplefilter("ignore")  # MLflow warns about its own schema inference
             logged = mlflow.pytorch.log_model(
                 network.eval(),
                 name="policy",
@@ -216,7 +228,7 @@ class Tracker:
             )
         register_policy(self._client, config, self.run_id, logged, score)
 
-    def artifact(self, path: Path) -> None:
+    def log_artifact(self, path: Path) -> None:
         """Uploads a file or a folder to the run's artifacts."""
         if path.is_dir():
             self._client.log_artifacts(self.run_id, str(path), path.name)
@@ -224,7 +236,7 @@ class Tracker:
             self._client.log_artifact(self.run_id, str(path))
 
     def set_views(self) -> None:
-        """Gives the experiment the views of `mlflow_views`; a store that refuses them goes without."""
+        """Adds the views of `mlflow_views` to the experiment; logs a warning for each that the store refuses."""
         now_ms = int(time.time() * 1000)
         for key, (name, state) in sweep_views().items():
             try:
@@ -234,7 +246,7 @@ class Tracker:
 
     @contextmanager
     def ending(self) -> Iterator[None]:
-        """Closes the run after the block: FINISHED, or FAILED by an error that passes on."""
+        """Ends the run with the `with` block: FINISHED, or FAILED if an error leaves the block."""
         status = "FAILED"
         try:
             yield
@@ -243,22 +255,22 @@ class Tracker:
             self.end(status)
 
     def end(self, status: str) -> None:
-        """Closes the run as FINISHED, KILLED or FAILED."""
+        """Ends the run with the status FINISHED, KILLED or FAILED."""
         self._client.set_terminated(self.run_id, status)
 
 
 def _param_text(name: str, value: object) -> str:
-    """A param's value; of a user's own file its checksum, since MLflow's params are short."""
-    is_file = name == "sources" and value
+    """The value of a param; for a user's own file its checksum, since MLflow limits the length of params."""
+    is_file = name.endswith("_source") and value
     return f"sha256:{hashlib.sha256(str(value).encode()).hexdigest()[:16]}" if is_file else str(value)
 
 
 COMMIT = "SHOAL_COMMIT"
-"""Names the commit where the code is a copy without its history, as in a submitted job."""
+"""Environment variable with the commit, for a copy of the code without its history, as in a submitted job."""
 
 
 def git_commit() -> str:
-    """The commit of the checkout that this module lies in, or the one that SHOAL_COMMIT names; else `unknown`."""
+    """The commit in SHOAL_COMMIT, else that of the checkout around this module, else `unknown`."""
     if os.environ.get(COMMIT):
         return os.environ[COMMIT]
     here = Path(__file__).parent

@@ -1,7 +1,8 @@
-"""Views that are there when a sweep's experiment opens in the MLflow UI: the grid, by method, failures.
+"""Saved views of a sweep's experiment in the MLflow UI: the whole grid, and grouped by method, robots and groups.
 
-The UI keeps a shared view as a compressed tag of the experiment. That format is MLflow's own and may change with its
-version, so views are a courtesy: whoever sets them goes on without where the store does not take them.
+MLflow has no API for views. Its UI stores one as a tag of the experiment with compressed JSON, and MLflow's own demo
+(`mlflow.demo.generators.saved_views`) writes such tags with `set_experiment_tag`, as this module does. The format may
+change with MLflow's version, and tests hold it against the installed one. A sweep works without its views.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import zlib
 from typing import Any
 
 TAG = "mlflow.sharedViewState."
+"""Prefix of a view's tag; the rest is the view's key."""
 SETUP_PARAMS = ("method", "robots", "groups")
 FAILURES = ("lost", "captured", "collision", "timeout")
 
@@ -28,8 +30,8 @@ def _bar(section: str, metric: str) -> dict[str, Any]:
 def _line(section: str, metric: str) -> dict[str, Any]:
     axes = {"xAxisKey": "step", "selectedXAxisMetricKey": "", "xAxisScaleType": "linear", "scaleType": "linear"}
     values = {"yAxisKey": "metric", "yAxisExpressions": [], "range": {}, "lineSmoothness": 0, "ignoreOutliers": False}
-    ours = {"useGlobalXaxisKey": True, "useGlobalLineSmoothing": True}
-    return _chart("LINE", section, metric, metricKey=metric, selectedMetricKeys=[metric], **axes, **values, **ours)
+    shared = {"useGlobalXaxisKey": True, "useGlobalLineSmoothing": True}
+    return _chart("LINE", section, metric, metricKey=metric, selectedMetricKeys=[metric], **axes, **values, **shared)
 
 
 def _section(uuid: str, name: str) -> dict[str, Any]:
@@ -44,7 +46,12 @@ def _section(uuid: str, name: str) -> dict[str, Any]:
 
 
 def _state(charts: dict[str, list[dict[str, Any]]], group_by: str | None = None) -> dict[str, Any]:
-    """What the UI stores of a view: `charts` by the name of their section."""
+    """The state that the UI stores for a view.
+
+    Args:
+      charts: by name of their section.
+      group_by: the param that runs are grouped by.
+    """
     keys = [{"mode": "param", "groupByData": group_by}]
     metrics = ["final/success_rate", *(f"final/{failure}_rate" for failure in FAILURES)]
     return {
@@ -68,12 +75,12 @@ def _state(charts: dict[str, list[dict[str, Any]]], group_by: str | None = None)
         "groupsExpanded": {},
         "globalLineChartConfig": {"xAxisKey": "step", "lineSmoothness": 0, "selectedXAxisMetricKey": ""},
         "compareRunSections": [_section(name.lower(), name) for name in charts],
-        "compareRunCharts": [chart for several in charts.values() for chart in several],
+        "compareRunCharts": [chart for section in charts.values() for chart in section],
     }
 
 
 def sweep_views() -> dict[str, tuple[str, dict[str, Any]]]:
-    """The views of a sweep's experiment: by key, the name that the UI shows and the state."""
+    """The views of a sweep's experiment: (name in the UI, state) by key."""
 
     def param(key: str) -> dict[str, str]:
         return {"key": key, "type": "PARAM"}
@@ -106,6 +113,12 @@ def sweep_views() -> dict[str, tuple[str, dict[str, Any]]]:
 
 
 def packed_view(name: str, state: dict[str, Any], time_ms: int) -> str:
-    """The tag's value as the UI reads it."""
+    """The value of a view's tag.
+
+    Args:
+      name: the view's name in the UI.
+      state: one of `sweep_views`.
+      time_ms: its creation, in ms since the epoch.
+    """
     packed = base64.b64encode(zlib.compress(json.dumps(state).encode())).decode()
     return json.dumps({"name": name, "createdAt": time_ms, "updatedAt": time_ms, "state": f"deflate;{packed}"})

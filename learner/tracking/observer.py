@@ -1,4 +1,4 @@
-"""Who is told of a run: a person, MLflow, Prometheus and the log of faults."""
+"""Passes what happens in a run to the user, MLflow, Prometheus and the log of faults."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from learner.tracking.journal import Row
 
 
 class Display(Protocol):
-    """What shows a run to a person."""
+    """Shows a run to the user."""
 
     def row(self, row: Row) -> None:
-        """A row of metrics was written."""
+        """Shows a row of metrics."""
         ...
 
     def message(self, text: str) -> None:
-        """Something worth a line happened."""
+        """Shows a line of text."""
         ...
 
 
 class MirroringObserver:
-    """Passes rows on to the display, to MLflow once a checkpoint covers them, and faults to their log.
+    """Implements `learner.loop.Observer`: shows everything, has rows delivered to MLflow, and logs faults.
 
     Args:
-      delivery: carries the journal to MLflow.
+      delivery: delivers the journal's rows to MLflow.
       faults: the run's log of faults.
-      display: shows all to a person.
-      monitor: is given every row too.
-      resumed: whether this process goes on with the run of another one.
+      display: shows the run to the user.
+      monitor: exports every row to Prometheus.
+      resumed: whether this session resumes the run of an earlier one.
     """
 
     def __init__(
@@ -50,21 +50,21 @@ class MirroringObserver:
         self._resumed = resumed
 
     def ready(self) -> None:
-        """Logs that the run is where another process left it."""
+        """Logs a resumed run, once its state is restored."""
         if self._resumed:
             self._faults.resumed()
 
     def row(self, row: Row) -> None:
-        """Shows the row."""
+        """Shows and exports the row."""
         self._display.row(row)
         self._monitor(row)
 
     def checkpoint(self, folder: Location, journal_offset: int) -> None:
-        """Asks for the delivery of the rows that the checkpoint covers."""
-        self._delivery.up_to(journal_offset)
+        """Requests the delivery of the rows that the checkpoint covers."""
+        self._delivery.deliver_up_to(journal_offset)
 
     def checkpoint_failed(self, env_steps: int, reason: str) -> None:
-        """Says so; the next checkpoint is tried as usual."""
+        """Shows the reason; the next checkpoint is tried when it is due."""
         self._display.message(f"the checkpoint of {env_steps:,} env steps could not be written: {reason}")
 
     def failed(self, failure: ComponentFailed, decision: Decision) -> None:
@@ -73,6 +73,6 @@ class MirroringObserver:
         self._display.message(f"{failure}: {decision.action}")
 
     def recovered(self, recovered: Recovered) -> None:
-        """Logs and shows that a component works again."""
+        """Logs and shows that a component has recovered."""
         self._faults.recovered(recovered)
         self._display.message(f"{recovered.component} works again after {recovered.seconds:.1f} s")

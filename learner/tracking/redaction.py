@@ -1,4 +1,4 @@
-"""Addresses that may hold a password: shown and stored without it."""
+"""Removes passwords from tracking URIs before they are shown or stored."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ VARIABLE = "MLFLOW_TRACKING_URI"
 
 
 def _secrets(uri: str) -> list[str]:
-    """Passwords of a URI, as written and as meant; a user name alone may be a token."""
+    """The password of a URI, percent-encoded and decoded; with HTTP, a user name without a password may be a token."""
     try:
         parts = urlsplit(uri)
         found = parts.password or (parts.username if parts.scheme in ("http", "https") else None)
-    except ValueError:  # no URI
+    except ValueError:  # not a URI
         return []
     return [secret for secret in dict.fromkeys([found or "", unquote(found or "")]) if secret]
 
 
 def hide_secrets(text: str, uri: str) -> str:
-    """A text, such as a client's error, without the password of the URI that it is about."""
+    """`text`, such as an error of MLflow's client, with the password of `uri` replaced by `***`."""
     for secret in _secrets(uri):
         for before in (":", "//"):
             text = text.replace(f"{before}{secret}@", f"{before}{HIDDEN}@")
@@ -30,15 +30,15 @@ def hide_secrets(text: str, uri: str) -> str:
 
 
 def public_uri(uri: str) -> str:
-    """The URI as it may be shown and stored."""
+    """`uri` with its password replaced by `***`."""
     return hide_secrets(uri, uri)
 
 
 def full_uri(stored: str) -> str:
-    """The URI behind a stored one: itself, or, if it had a password, that of MLFLOW_TRACKING_URI.
+    """The URI with its password, taken from the environment variable MLFLOW_TRACKING_URI where `stored` hides one.
 
     Raises:
-      ConfigError: the variable does not hold it.
+      ConfigError: the variable does not hold that URI.
     """
     if f"{HIDDEN}@" not in stored:
         return stored

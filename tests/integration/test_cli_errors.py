@@ -151,7 +151,7 @@ class TestWithARun:
         assert "shoal resume r" in error
 
     def test_a_run_that_another_process_trains_is_refused(self, capsys, runs):
-        with RunFolder(runs / "r").hold():
+        with RunFolder(runs / "r").lock():
             code, error = run(capsys, "resume", "r", "--runs-dir", str(runs), "--total-env-steps", "9000")
         assert code == 2
         assert "another process is training" in error

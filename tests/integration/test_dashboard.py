@@ -25,7 +25,7 @@ from deploy.runs.policy_lookup import find_policy
 from learner.checkpoints.checkpoint import newest_valid
 from learner.loop import TrainingLoop
 from learner.run_folder import RunFolder
-from learner.sweep.cell import SweepPlace, run_cell
+from learner.sweep.cell import SweepLocation, run_cell
 from learner.sweep.grid import SweepConfig, make_cells
 from learner.tracking.journal import Journal, read_rows
 from learner.tracking.mlflow_run import Tracker
@@ -60,7 +60,7 @@ def sweep(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sweeps") / "small"
     uri = f"sqlite:///{folder.parent / 'mlflow.db'}"
     Tracker(uri, "cells", str(folder.parent / "artifacts"))
-    place = SweepPlace(folder / "cells", uri, "cells")
+    place = SweepLocation(folder / "cells", uri, "cells")
     tables = [run_cell(SWEEP, cell, place, lambda row: None) for cell in make_cells(SWEEP)]
     mlflow.set_tracking_uri(None)
     write_table(folder / "results.csv", [row for table in tables for row in read_table(table)])

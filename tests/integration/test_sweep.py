@@ -7,7 +7,7 @@ import pytest
 
 from actors.evaluation.result_table import read_table, write_table
 from deploy.cli import main
-from learner.sweep.cell import SweepPlace, run_cell
+from learner.sweep.cell import SweepLocation, run_cell
 from learner.sweep.grid import SweepConfig, make_cells
 from learner.sweep.tune import run_cells
 from learner.tracking.mlflow_run import Tracker
@@ -40,7 +40,7 @@ def results_in_one_process(folder):
     """What the cells give when each is run in this process."""
     uri = f"sqlite:///{folder / 'mlflow.db'}"
     Tracker(uri, "cells", str(folder / "artifacts"))
-    place = SweepPlace(folder / "cells", uri, "cells")
+    place = SweepLocation(folder / "cells", uri, "cells")
     tables = [run_cell(SWEEP, cell, place, lambda row: None) for cell in make_cells(SWEEP)]
     mlflow.set_tracking_uri(None)
     return sorted(row for table in tables for row in read_table(table))
@@ -157,7 +157,7 @@ def test_a_cell_that_crashes_fails_with_its_reason_and_the_others_go_on(capsys, 
     good, bad = make_cells(SWEEP)[:2]
     told = Told()
     (tmp_path / "cells" / bad.key / "artifacts" / "results.csv.part").mkdir(parents=True)  # where a file is written
-    run_cells(SWEEP, [bad, good], SweepPlace(tmp_path / "cells", uri, "cells"), None, 1, told)
+    run_cells(SWEEP, [bad, good], SweepLocation(tmp_path / "cells", uri, "cells"), None, 1, told)
     last = {event[1]: event for event in told.events}
     assert last[good.key] == ("finished", good.key)
     assert last[bad.key][0] == "failed" and "IsADirectoryError" in last[bad.key][2]

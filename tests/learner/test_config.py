@@ -1,4 +1,4 @@
-"""The run's settings: what is refused, and what tells two configs apart."""
+"""The run's config: what is refused, and what its hash depends on."""
 
 import dataclasses
 import json
@@ -21,7 +21,7 @@ def test_the_defaults_work_and_are_frozen():
 
 @pytest.mark.parametrize("name", AT_LEAST_ONE)
 @pytest.mark.parametrize("value", [0, -1, 1.5, 2.0, "3", None, True, math.nan])
-def test_counts_must_be_whole_and_positive(name, value):
+def test_counts_must_be_positive_whole_numbers(name, value):
     with pytest.raises(ConfigError, match=name):
         RunConfig(**{name: value})
 
@@ -77,7 +77,7 @@ def test_values_that_contradict_each_other_are_refused(settings, words):
         RunConfig(**settings)
 
 
-def test_the_last_values_that_work():
+def test_limits_themselves_are_accepted():
     RunConfig(replay_capacity=32_768, min_replay=32_768, replay_shards=4, total_env_steps=32_769)
     RunConfig(seed=2**31 - 1, discount=1.0, epsilon_start=0.0, epsilon_end=1, ladder_base=1, ladder_exponent=0)
 
@@ -88,12 +88,12 @@ def test_the_learning_rate_falls_linearly_and_stays():
     assert rates == pytest.approx([1e-3, 8e-4, 2e-4, 2e-4])
 
 
-def test_a_constant_learning_rate_is_an_end_like_the_start():
+def test_a_learning_rate_that_ends_where_it_starts_is_constant():
     config = RunConfig(learning_rate=1e-3, learning_rate_end=1e-3, learning_rate_decay_env_steps=1000)
     assert {config.learning_rate_at(env_steps) for env_steps in range(0, 3000, 100)} == {1e-3}
 
 
-def test_the_cosine_schedule_is_pytorchs():
+def test_the_cosine_schedule_is_that_of_pytorch():
     config = RunConfig(
         learning_rate=1e-3,
         learning_rate_end=2e-4,
@@ -150,7 +150,7 @@ def test_bad_dicts_are_refused(values, words):
 
 
 def changed(config, name):
-    """`config` with another value of one field that can work."""
+    """`config` with another valid value of one field."""
     value = getattr(config, name)
     others = {
         "engine": "ray" if value == "process" else "process",
@@ -174,7 +174,7 @@ def changed(config, name):
 
 
 @pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(RunConfig)])
-def test_the_hash_tells_configs_apart_but_for_where_and_how_long(small_run, name):
+def test_the_hash_depends_on_every_field_but_length_and_placement(small_run, name):
     other = changed(small_run, name)
     assert other != small_run
     same = config_hash(other) == config_hash(small_run)

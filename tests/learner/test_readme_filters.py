@@ -41,7 +41,7 @@ def names(store, tmp_path_factory):
     for name, (world, tags, success, captured, status) in RUNS.items():
         tracker = Tracker(store, "filters", str(tmp_path_factory.mktemp("artifacts")))
         tracker.start(RunConfig(world=WorldConfig(**world), n_step=3), tags)
-        tracker.final({"success_rate": success, "captured_rate": captured}, 1_700_000_000_000)
+        tracker.log_results({"success_rate": success, "captured_rate": captured}, 1_700_000_000_000)
         tracker.end(status)
         ids[tracker.run_id] = name
     return ids

@@ -1,4 +1,4 @@
-"""A run's folder: its files, and the names that users give."""
+"""A run's folder: its files, its lock, and finding it by name."""
 
 import subprocess
 import sys
@@ -25,7 +25,7 @@ def test_identity_round_trip(tmp_path):
     assert folder.identity() == IDENTITY._replace(mlflow_run_id="new")
 
 
-def test_paths_do_not_move_with_the_working_directory(tmp_path, monkeypatch, small_run):
+def test_paths_do_not_depend_on_the_working_directory(tmp_path, monkeypatch, small_run):
     monkeypatch.chdir(tmp_path)
     folder = RunFolder(find_path := (tmp_path / "one").relative_to(tmp_path))
     folder.save_config(small_run)
@@ -65,7 +65,7 @@ def test_runs_are_found_by_name_and_by_path(tmp_path, small_run):
     assert find_run(str(runs / "a"), tmp_path / "elsewhere").path == runs / "a"
 
 
-def test_an_unknown_run_is_refused_with_those_there_are(tmp_path, small_run):
+def test_an_unknown_run_is_refused_with_a_list_of_runs(tmp_path, small_run):
     with pytest.raises(ConfigError, match="there are no runs in"):
         find_run("a", tmp_path)
     (tmp_path / "empty").mkdir()
@@ -75,12 +75,12 @@ def test_an_unknown_run_is_refused_with_those_there_are(tmp_path, small_run):
         find_run("empty", tmp_path)
 
 
-def test_a_run_is_held_by_one_process_at_a_time(tmp_path):
+def test_a_run_is_locked_by_one_process_at_a_time(tmp_path):
     path = tmp_path / "one"
-    other = "import sys, pathlib, learner.run_folder as r\nwith r.RunFolder(pathlib.Path(sys.argv[1])).hold(): pass"
-    with RunFolder(path).hold():
+    other = "import sys, pathlib, learner.run_folder as r\nwith r.RunFolder(pathlib.Path(sys.argv[1])).lock(): pass"
+    with RunFolder(path).lock():
         with pytest.raises(ConfigError, match="another process is training .*one"):
-            RunFolder(path).hold().__enter__()
+            RunFolder(path).lock().__enter__()
         done = subprocess.run([sys.executable, "-c", other, str(path)], capture_output=True, text=True, check=False)
         assert done.returncode != 0 and "another process is training" in done.stderr
     done = subprocess.run([sys.executable, "-c", other, str(path)], capture_output=True, text=True, check=False)

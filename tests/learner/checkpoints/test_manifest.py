@@ -1,4 +1,4 @@
-"""A manifest: read back as it was, and refused with a sentence whatever else it is."""
+"""A manifest round-trips, and everything else is refused with a sentence."""
 
 import hashlib
 import json
@@ -17,13 +17,13 @@ from learner.checkpoints.manifest import (
 )
 
 SUM = FileSum(3, "0" * 64)
-PLAIN = st.text("abcXYZ019.-_ é", min_size=1, max_size=8).filter(lambda part: part not in (".", ".."))
+PLAIN = st.text("abcXYZ019.-_ é", min_size=1, max_size=8).filter(lambda name: name not in (".", ".."))
 NAMES = st.lists(PLAIN, min_size=1, max_size=4).map("/".join).filter(lambda name: name != "manifest.json")
 SUMS = st.builds(FileSum, st.integers(0, 2**63), st.binary(min_size=32, max_size=32).map(bytes.hex))
 
 
 def signed(values):
-    """A manifest with a right checksum of its own, as someone who means harm would write it."""
+    """A manifest with a valid checksum of its own, as an attacker would write it."""
     text = json.dumps(values).encode()
     return text + b"\n" + hashlib.sha256(text).hexdigest().encode() + b"\n"
 
@@ -52,7 +52,7 @@ def test_round_trip(env_steps, files, own):
     ],
 )
 def test_a_name_that_leads_elsewhere_is_refused(name):
-    with pytest.raises(UnusableCheckpointError, match="no file of a checkpoint"):
+    with pytest.raises(UnusableCheckpointError, match="cannot be a file of a checkpoint"):
         decode_manifest(encode_manifest(1, {"state.json": SUM, name: SUM}), "x")
 
 
@@ -60,7 +60,7 @@ def test_a_name_that_leads_elsewhere_is_refused(name):
     "found",
     [None, 3, "0" * 64, [], [3], [3, "0" * 63], [3, "G" * 64], [-1, "0" * 64], [True, "0" * 64], [1.5, "0" * 64]],
 )
-def test_a_sum_that_is_none_is_refused(found):
+def test_an_invalid_sum_is_refused(found):
     values = {"format": "shoal-checkpoint-5", "env_steps": 1, "files": {"state.json": [3, "0" * 64], "a": found}}
     with pytest.raises(UnusableCheckpointError, match="no length and SHA-256"):
         decode_manifest(signed(values), "x")
@@ -70,7 +70,7 @@ def test_a_sum_that_is_none_is_refused(found):
 @pytest.mark.parametrize("env_steps", [1, -1, "1", None, True, 1.5])
 def test_other_types_are_refused(files, env_steps):
     values = {"format": "shoal-checkpoint-5", "env_steps": env_steps, "files": files}
-    with pytest.raises(UnusableCheckpointError, match="other content than a manifest"):
+    with pytest.raises(UnusableCheckpointError, match="does not hold a manifest"):
         decode_manifest(signed(values), "x")
 
 
@@ -86,22 +86,22 @@ def test_any_signed_json_is_refused(values):
         decode_manifest(signed(values), "x")
 
 
-def test_json_without_end_is_refused():
+def test_endlessly_nested_json_is_refused():
     text = b"[" * 200_000
     with pytest.raises(UnusableCheckpointError):
         decode_manifest(text + b"\n" + hashlib.sha256(text).hexdigest().encode() + b"\n", "x")
 
 
 @pytest.mark.parametrize(
-    ("version", "kind"), [(1, UnusableCheckpointError), (4, UnusableCheckpointError), (6, CheckpointError)]
+    ("version", "error"), [(1, UnusableCheckpointError), (4, UnusableCheckpointError), (6, CheckpointError)]
 )
-def test_another_version_is_refused_by_name(version, kind):
+def test_another_version_is_refused_by_name(version, error):
     with pytest.raises(CheckpointError, match=f"shoal-checkpoint-{version}.*shoal-checkpoint-5") as caught:
         decode_manifest(signed({"format": f"shoal-checkpoint-{version}"}), "runs/r")
-    assert type(caught.value) is kind
+    assert type(caught.value) is error
 
 
-def test_any_flipped_bit_is_noticed():
+def test_every_flipped_bit_and_every_truncation_is_detected():
     whole = encode_manifest(7, {"state.json": SUM, "learner.safetensors": FileSum(99, "ab" * 32)})
     for place in range(len(whole)):
         for bit in range(8):

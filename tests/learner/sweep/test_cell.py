@@ -1,4 +1,4 @@
-"""One cell of a sweep: its results are those of its episodes, and no crash changes or doubles them."""
+"""One cell of a sweep: its results are those of its episodes, and no crash changes or duplicates them."""
 
 import dataclasses
 import shutil
@@ -19,7 +19,7 @@ from learner.checkpoints.checkpoint import finished_names
 from learner.checkpoints.manifest import CheckpointError
 from learner.export.policy_file import read_saved_policy
 from learner.run_folder import RunFolder
-from learner.sweep.cell import SweepPlace, run_cell
+from learner.sweep.cell import SweepLocation, run_cell
 from learner.sweep.grid import Cell, SweepConfig, cell_hash
 from learner.tracking.mlflow_run import Tracker
 from sim_core.outcomes import ENDED, Outcome
@@ -72,8 +72,8 @@ def crashing_at(env_steps):
 
 
 def test_a_cells_table_counts_its_stored_episodes(store, cell, tmp_path):
-    place = SweepPlace(tmp_path, store, "cells")
-    rows = read_table(run_cell(SWEEP, cell, place, lambda row: None))
+    location = SweepLocation(tmp_path, store, "cells")
+    rows = read_table(run_cell(SWEEP, cell, location, lambda row: None))
     assert {(row.robots, row.groups): row.episodes for row in rows} == {(3, 2): 40, (3, 1): 10, (4, 1): 10, (4, 2): 10}
     folder = RunFolder(tmp_path / cell.key)
     weights = read_saved_policy(folder.policy, cell.config, env_shape(cell.config.env))
@@ -97,9 +97,9 @@ def test_a_cells_table_counts_its_stored_episodes(store, cell, tmp_path):
     assert not folder.checkpoints.exists()
 
 
-def test_a_baselines_cell_counts_its_episodes(store, cell, tmp_path):
+def test_a_baselines_table_counts_its_episodes(store, cell, tmp_path):
     cell = Cell("greedy-cell", cell.config, "greedy")
-    rows = read_table(run_cell(SWEEP, cell, SweepPlace(tmp_path, store, "cells"), crashing_at(0)))
+    rows = read_table(run_cell(SWEEP, cell, SweepLocation(tmp_path, store, "cells"), crashing_at(0)))
     played = evaluate(cell.config.env, Baseline.GREEDY, list(range(77, 77 + 40)))
     assert [(row.policy, row.episodes, row.is_fixed) for row in rows] == [("greedy", 40, True)]
     assert [rows[0].count(kind) for kind in ENDED] == [int((played.outcome == kind).sum()) for kind in ENDED]
@@ -109,71 +109,71 @@ def test_a_baselines_cell_counts_its_episodes(store, cell, tmp_path):
     assert runs[0].data.metrics["final/success_rate"] == rows[0].goal / 40
 
 
-def test_a_baselines_cell_that_failed_is_played_again_in_its_run(store, cell, tmp_path, monkeypatch):
+def test_a_failed_baseline_is_evaluated_again_in_the_same_mlflow_run(store, cell, tmp_path, monkeypatch):
     cell = Cell("greedy-again", cell.config, "greedy")
-    place = SweepPlace(tmp_path / "sweep" / "cells", store, "cells")
+    location = SweepLocation(tmp_path / "sweep" / "cells", store, "cells")
 
     def fail(*arguments):
         raise Crash
 
     with monkeypatch.context() as patch:
-        patch.setattr("learner.sweep.cell._log_table", fail)  # after its results were logged
+        patch.setattr("learner.sweep.cell._log_table", fail)  # after MLflow has the results
         with pytest.raises(Crash):
-            run_cell(SWEEP, cell, place, id)
+            run_cell(SWEEP, cell, location, id)
     assert [run.info.status for run in runs_of(store, cell)[1]] == ["FAILED"]
-    run_cell(SWEEP, cell, place, id)
+    run_cell(SWEEP, cell, location, id)
     client, runs = runs_of(store, cell)
     assert [run.info.status for run in runs] == ["FINISHED"]
     assert len(client.get_metric_history(runs[0].info.run_id, "final/success_rate")) == 1
 
 
-def test_two_sweeps_in_one_experiment_keep_apart(store, cell, tmp_path):
+def test_two_sweeps_in_one_experiment_have_runs_of_their_own(store, cell, tmp_path):
     cell = Cell("greedy-twice", cell.config, "greedy")
     for sweep in ("one", "two", "one"):
         shutil.rmtree(tmp_path / sweep, ignore_errors=True)
-        run_cell(SWEEP, cell, SweepPlace(tmp_path / sweep / "cells", store, "cells"), id)
+        run_cell(SWEEP, cell, SweepLocation(tmp_path / sweep / "cells", store, "cells"), id)
     assert sorted(run.data.tags["sweep"] for run in runs_of(store, cell)[1]) == ["one", "two"]
 
 
-def test_a_finished_cell_of_which_more_is_wanted_plays_its_policy_again(store, cell, tmp_path):
+def test_a_finished_cell_evaluates_its_policy_again_where_more_is_wanted(store, cell, tmp_path):
     cell = cell._replace(key=f"{cell.key}-more")
-    place = SweepPlace(tmp_path, store, "cells")
+    location = SweepLocation(tmp_path, store, "cells")
     small = dataclasses.replace(SWEEP, robots=(3,), groups=(2,))
-    fixed = read_table(run_cell(small, cell, place, lambda row: None))
+    fixed = read_table(run_cell(small, cell, location, lambda row: None))
     assert len(fixed) == 1
-    rows = read_table(run_cell(SWEEP, cell, place, crashing_at(0)))  # nothing is trained
+    rows = read_table(run_cell(SWEEP, cell, location, crashing_at(0)))  # nothing is trained
     other = cell._replace(key=f"{cell.key}-whole")
-    assert rows == read_table(run_cell(SWEEP, other, place, lambda row: None)) and fixed[0] in rows
+    assert rows == read_table(run_cell(SWEEP, other, location, lambda row: None)) and fixed[0] in rows
     assert [run.info.status for run in runs_of(store, cell)[1]] == ["FINISHED"]
 
 
-def test_a_training_too_short_for_a_row_of_metrics_ends_like_others(store, cell, tmp_path):
+def test_a_training_too_short_for_a_row_of_metrics_finishes(store, cell, tmp_path):
     config = dataclasses.replace(cell.config, log_every_env_steps=100_000, eval_every_env_steps=100_000)
     short = Cell(f"{cell.key}-short", config)
-    assert len(read_table(run_cell(SWEEP, short, SweepPlace(tmp_path, store, "cells"), crashing_at(0)))) == 4
+    assert len(read_table(run_cell(SWEEP, short, SweepLocation(tmp_path, store, "cells"), crashing_at(0)))) == 4
     runs = runs_of(store, short)[1]
     assert [run.info.status for run in runs] == ["FINISHED"] and "final/success_rate" in runs[0].data.metrics
 
 
 def test_a_finished_cell_is_not_run_again(store, cell, tmp_path):
-    place = SweepPlace(tmp_path, store, "cells")
-    table = run_cell(SWEEP, cell, place, lambda row: None)
+    location = SweepLocation(tmp_path, store, "cells")
+    table = run_cell(SWEEP, cell, location, lambda row: None)
     before = table.stat().st_mtime_ns
-    assert run_cell(SWEEP, cell, place, crashing_at(0)) == table
+    assert run_cell(SWEEP, cell, location, crashing_at(0)) == table
     assert table.stat().st_mtime_ns == before
 
 
 @pytest.mark.parametrize("crashes", [[0], [1_500], [2_600, 3_500]])
-def test_a_crashed_cell_ends_as_if_nothing_had_happened(store, cell, tmp_path, crashes):
-    key = f"{cell.key}-{len(crashes)}-{crashes[0]}"  # each case has its run
+def test_a_crashed_cell_has_the_results_of_an_undisturbed_one(store, cell, tmp_path, crashes):
+    key = f"{cell.key}-{len(crashes)}-{crashes[0]}"  # each case has an MLflow run of its own
     cell = cell._replace(key=key)
-    whole = read_table(run_cell(SWEEP, cell._replace(key=f"{key}-whole"), SweepPlace(tmp_path, store, "cells"), id))
-    place = SweepPlace(tmp_path, store, "cells")
+    whole = read_table(run_cell(SWEEP, cell._replace(key=f"{key}-whole"), SweepLocation(tmp_path, store, "cells"), id))
+    location = SweepLocation(tmp_path, store, "cells")
     for env_steps in crashes:
         with pytest.raises(Crash):
-            run_cell(SWEEP, cell, place, crashing_at(env_steps))
+            run_cell(SWEEP, cell, location, crashing_at(env_steps))
         assert not (tmp_path / key / "results.csv").exists()
-    assert read_table(run_cell(SWEEP, cell, place, id)) == whole
+    assert read_table(run_cell(SWEEP, cell, location, id)) == whole
     client, runs = runs_of(store, cell)
     assert len(runs) == 1 and runs[0].info.status == "FINISHED"
     history = client.get_metric_history(runs[0].info.run_id, "eval/success_rate")
@@ -186,18 +186,18 @@ def history_of(store, cell, key):
     return [metric.step for metric in client.get_metric_history(runs[0].info.run_id, key)]
 
 
-def test_a_cell_of_which_every_checkpoint_is_damaged_begins_anew_and_logs_nothing_twice(
+def test_a_cell_whose_checkpoints_are_all_damaged_starts_afresh_and_logs_nothing_twice(
     store, cell, tmp_path, monkeypatch
 ):
     cell = cell._replace(key=f"{cell.key}-damaged")
-    place = SweepPlace(tmp_path, store, "cells")
+    location = SweepLocation(tmp_path, store, "cells")
 
     def crash(*args):
         raise Crash
 
-    monkeypatch.setattr("learner.sweep.cell.save_policy", crash)  # when MLflow has all of the training
+    monkeypatch.setattr("learner.sweep.cell.save_policy", crash)  # once MLflow has the whole training
     with pytest.raises(Crash):
-        run_cell(SWEEP, cell, place, id)
+        run_cell(SWEEP, cell, location, id)
     monkeypatch.undo()
     logged = mlflow.MlflowClient(store).get_metric_history(runs_of(store, cell)[1][0].info.run_id, "train/loss")
     assert logged, "rows had reached MLflow before the crash"
@@ -205,33 +205,33 @@ def test_a_cell_of_which_every_checkpoint_is_damaged_begins_anew_and_logs_nothin
     assert checkpoints
     for state in checkpoints:
         state.write_text("{}")
-    run_cell(SWEEP, cell, place, id)
+    run_cell(SWEEP, cell, location, id)
     for key, count in (("train/loss", 3), ("eval/success_rate", 3), ("final/success_rate", 1)):
         steps = history_of(store, cell, key)
         assert len(steps) == len(set(steps)) >= count
 
 
-def test_a_checkpoint_of_another_config_is_no_reason_to_begin_anew(store, cell, tmp_path):
+def test_a_checkpoint_with_another_config_is_refused_and_kept(store, cell, tmp_path):
     cell = cell._replace(key=f"{cell.key}-other")
-    place = SweepPlace(tmp_path, store, "cells")
+    location = SweepLocation(tmp_path, store, "cells")
     checkpoints = tmp_path / cell.key / "checkpoints"
 
     def crash_after_a_checkpoint(row):
         if row.env_steps >= 2_600:
-            while not finished_names(checkpoints):  # pytest's limit ends a wait in vain
+            while not finished_names(checkpoints):  # pytest's timeout ends the wait
                 time.sleep(0.01)
             raise Crash
 
     with pytest.raises(Crash):
-        run_cell(SWEEP, cell, place, crash_after_a_checkpoint)
+        run_cell(SWEEP, cell, location, crash_after_a_checkpoint)
     kept = sorted(checkpoints.iterdir())
     other = cell._replace(config=dataclasses.replace(cell.config, learning_rate=0.5))
     with pytest.raises(CheckpointError, match="learning_rate is 0.5 instead of 0.001"):
-        run_cell(SWEEP, other._replace(key=cell.key), place, id)
+        run_cell(SWEEP, other._replace(key=cell.key), location, id)
     assert sorted(checkpoints.iterdir()) == kept
 
 
-def test_nothing_writes_on_after_a_crash(store, cell, tmp_path, monkeypatch):
+def test_nothing_is_written_after_a_crash(store, cell, tmp_path, monkeypatch):
     cell = cell._replace(key=f"{cell.key}-writes")
 
     def slow_sync(path):
@@ -240,19 +240,18 @@ def test_nothing_writes_on_after_a_crash(store, cell, tmp_path, monkeypatch):
 
     monkeypatch.setattr("actors.storage.fragment_writer.sync_all", slow_sync)
     with pytest.raises(Crash):
-        run_cell(SWEEP, cell, SweepPlace(tmp_path, store, "cells"), crashing_at(1_500))  # one begins at 1,000
-    assert not [
-        thread.name for thread in threading.enumerate() if thread.name.startswith(("shoal-fragment", "shoal-ch"))
-    ]
+        run_cell(SWEEP, cell, SweepLocation(tmp_path, store, "cells"), crashing_at(1_500))  # checkpoint at 1,000
+    writers = ("shoal-fragment", "shoal-checkpoint")
+    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith(writers)]
     checkpoints = tmp_path / cell.key / "checkpoints"
     assert [path.name for path in checkpoints.iterdir()] == finished_names(checkpoints)
 
 
 def test_a_cell_whose_folder_is_gone_keeps_its_mlflow_run(store, cell, tmp_path):
     cell = cell._replace(key=f"{cell.key}-gone")
-    place = SweepPlace(tmp_path, store, "cells")
+    location = SweepLocation(tmp_path, store, "cells")
     with pytest.raises(Crash):
-        run_cell(SWEEP, cell, place, crashing_at(2_000))
+        run_cell(SWEEP, cell, location, crashing_at(2_000))
     shutil.rmtree(tmp_path / cell.key)
-    run_cell(SWEEP, cell, place, id)
+    run_cell(SWEEP, cell, location, id)
     assert len(runs_of(store, cell)[1]) == 1

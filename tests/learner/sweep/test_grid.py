@@ -1,4 +1,4 @@
-"""The grid of a sweep: which cells there are, what each is tested in, and which are done."""
+"""The grid of a sweep: its cells, the worlds that each is evaluated in, and which cells are done."""
 
 import dataclasses
 
@@ -6,14 +6,22 @@ import pytest
 
 from actors.evaluation.result_table import ResultRow
 from learner.config import RunConfig, to_dict
-from learner.sweep.grid import SweepConfig, cell_hash, done_cells, make_cell, make_cells, other_worlds, wanted
+from learner.sweep.grid import (
+    SweepConfig,
+    cell_hash,
+    done_cells,
+    extrapolation_worlds,
+    make_cell,
+    make_cells,
+    wanted_episodes,
+)
 from sim_core.checks import ConfigError
 
 SMALL = SweepConfig(robots=(5, 10), groups=(1, 2), seeds=(0,), episodes=30, extrapolation_episodes=20, baselines=())
 
 
 def rows_of(sweep, cell):
-    """A full set of results of a cell."""
+    """A complete set of results of a cell."""
     world = cell.config.world
     return [
         ResultRow(
@@ -34,11 +42,11 @@ def rows_of(sweep, cell):
             mean_length_steps=1.0,
             config=cell_hash(cell.config),
         )
-        for (robots, groups), episodes in wanted(sweep, cell).items()
+        for (robots, groups), episodes in wanted_episodes(sweep, cell).items()
     ]
 
 
-def test_the_dissertations_grid_has_75_setups_a_seed():
+def test_the_dissertations_grid_has_75_setups_per_seed():
     cells = make_cells(SweepConfig(seeds=(0, 1), baselines=()))
     assert len(cells) == 150 and len({cell.key for cell in cells}) == 150
     setups = {(cell.config.world.method, cell.config.world.robots, cell.config.world.groups) for cell in cells}
@@ -49,19 +57,19 @@ def test_the_dissertations_grid_has_75_setups_a_seed():
     assert weights == sorted(weights) and weights[0] < weights[-1]
 
 
-def test_a_policy_is_tested_wherever_its_state_fits():
+def test_a_policy_is_evaluated_in_every_setup_that_its_state_fits():
     sweep = SweepConfig()
-    sensor = other_worlds(sweep, make_cell(sweep, "sensor", 10, 2, 0))
+    sensor = extrapolation_worlds(sweep, make_cell(sweep, "sensor", 10, 2, 0))
     assert len({(world.robots, world.groups) for world in sensor}) == 24
     assert (10, 2) not in {(world.robots, world.groups) for world in sensor}
     for method in ("in", "out"):
-        others = other_worlds(sweep, make_cell(sweep, method, 10, 2, 0))
+        others = extrapolation_worlds(sweep, make_cell(sweep, method, 10, 2, 0))
         assert {(world.robots, world.groups) for world in others} == {(r, 2) for r in (5, 15, 20, 25)}
         assert {world.method for world in others} == {method}
-    assert other_worlds(SweepConfig(extrapolation="none"), make_cell(sweep, "sensor", 10, 2, 0)) == []
+    assert extrapolation_worlds(SweepConfig(extrapolation="none"), make_cell(sweep, "sensor", 10, 2, 0)) == []
 
 
-def test_a_cells_key_tells_apart_all_that_decides_its_results():
+def test_a_cells_hash_depends_on_everything_that_decides_its_results():
     base = make_cell(SMALL, "sensor", 5, 2, 0)
     assert base.key.startswith("sensor-5r2g-s0-")
     assert make_cell(SMALL, "sensor", 5, 2, 0).key == base.key
@@ -78,12 +86,12 @@ def test_a_cells_key_tells_apart_all_that_decides_its_results():
         assert cell_hash(dataclasses.replace(base.config, **where)) == cell_hash(base.config)
 
 
-def test_a_setting_that_is_as_by_default_does_not_count(monkeypatch):
+def test_the_hash_ignores_settings_with_their_default(monkeypatch):
     config = make_cell(SMALL, "out", 5, 2, 0).config
     before = cell_hash(config)
     plain = to_dict
 
-    def with_more(some):  # a later version, whose run and world have a setting more
+    def with_more(some):  # a later version, with one more setting of the run and of the world
         values = plain(some)
         return {**values, "later": 3, "world": {**values["world"], "later_m": 0.5}}
 
@@ -92,10 +100,10 @@ def test_a_setting_that_is_as_by_default_does_not_count(monkeypatch):
     assert cell_hash(dataclasses.replace(config, n_step=4)) != before
 
 
-def test_the_length_of_the_training_takes_its_schedule_along():
+def test_schedules_are_stretched_to_the_length_of_the_training():
     config = make_cell(dataclasses.replace(SMALL, env_steps=400_000), "out", 5, 1, 0).config
     assert config.total_env_steps == config.learning_rate_decay_env_steps == 400_000
-    assert config.importance_exponent_env_steps == RunConfig().importance_exponent_env_steps  # nothing hangs on it
+    assert config.importance_exponent_env_steps == RunConfig().importance_exponent_env_steps  # unused
     prioritised = dataclasses.replace(SMALL, env_steps=400_000, set=("replay=prioritised",))
     assert make_cell(prioritised, "out", 5, 1, 0).config.importance_exponent_env_steps == 400_000
     given = dataclasses.replace(prioritised, set=("replay=prioritised", "importance_exponent_env_steps=7"))
@@ -104,7 +112,7 @@ def test_the_length_of_the_training_takes_its_schedule_along():
     assert config.epsilon_decay_env_steps / 400_000 == preset.epsilon_decay_env_steps / preset.total_env_steps
 
 
-def test_baselines_are_played_in_the_world_of_every_cell():
+def test_baselines_are_evaluated_in_the_world_of_every_cell():
     sweep = dataclasses.replace(SMALL, baselines=("greedy", "fl-orca"), baseline_episodes=7)
     cells = make_cells(sweep)
     played, trained = cells[:-12], cells[-12:]
@@ -115,7 +123,9 @@ def test_baselines_are_played_in_the_world_of_every_cell():
     for policy in ("greedy", "fl-orca"):
         worlds = [cell.config.world for cell in played if cell.policy == policy]
         assert sorted(worlds, key=str) == sorted((cell.config.world for cell in trained), key=str)
-    assert all(wanted(sweep, cell) == {(c.robots, c.groups): 7} for cell in played for c in [cell.config.world])
+    assert all(
+        wanted_episodes(sweep, cell) == {(c.robots, c.groups): 7} for cell in played for c in [cell.config.world]
+    )
     assert played[0].name == "greedy: sensor 5r×1g"
     rows = [row._replace(policy=cell.policy) for cell in played for row in rows_of(sweep, cell)]
     assert set(done_cells(sweep, cells, rows)) == {cell.key for cell in played}
@@ -123,7 +133,7 @@ def test_baselines_are_played_in_the_world_of_every_cell():
     assert not done_cells(sweep, cells, learned)
 
 
-def test_settings_take_the_place_of_the_presets():
+def test_settings_override_the_presets():
     sweep = dataclasses.replace(SMALL, set=("n_step=5", "apf_rows=all", "time_step_s=0.04", "hidden_sizes=[64, 32]"))
     config, preset = make_cell(sweep, "in", 5, 2, 0).config, make_cell(SMALL, "in", 5, 2, 0).config
     assert (config.n_step, config.hidden_sizes, config.world.apf_rows) == (5, (64, 32), "all")
@@ -148,17 +158,17 @@ def test_settings_take_the_place_of_the_presets():
         ("total_env_steps=70000", "cannot change 'total_env_steps'"),
     ],
 )
-def test_what_is_no_setting_is_refused(text, words):
+def test_an_invalid_override_is_refused(text, words):
     with pytest.raises(ConfigError, match=words):
         SweepConfig(set=(text,))
 
 
-def test_a_setting_that_cannot_work_is_refused_before_anything_runs():
+def test_an_override_with_an_invalid_value_is_refused_before_anything_runs():
     with pytest.raises(ConfigError, match="n_step must be a whole number"):
         make_cells(dataclasses.replace(SMALL, set=("n_step=three",)))
 
 
-def test_a_cell_is_done_when_all_its_results_are_there():
+def test_a_cell_is_done_when_its_results_are_complete():
     cells = make_cells(SMALL)
     rows = [row for cell in cells for row in rows_of(SMALL, cell)]
     done = done_cells(SMALL, cells, rows)
@@ -177,7 +187,7 @@ def test_a_cell_is_done_when_all_its_results_are_there():
             assert set(done_cells(SMALL, cells, [*others, decoy])) == set(done) - {first.key}, decoy
 
 
-def test_results_of_more_episodes_do_as_well():
+def test_results_of_more_episodes_are_accepted():
     cell = make_cell(SMALL, "in", 5, 2, 0)
     rows = [row._replace(episodes=row.episodes + 5, goal=row.goal + 5) for row in rows_of(SMALL, cell)]
     assert done_cells(SMALL, [cell], rows) == {cell.key: rows}
@@ -200,7 +210,7 @@ def test_results_of_more_episodes_do_as_well():
         ({"extrapolation": "some"}, "extrapolation must be one of"),
     ],
 )
-def test_what_cannot_be_is_refused(settings, words):
+def test_invalid_settings_are_refused(settings, words):
     with pytest.raises(ConfigError, match=words):
         SweepConfig(**settings)
 

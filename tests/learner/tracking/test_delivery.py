@@ -1,4 +1,4 @@
-"""Rows on their way to MLflow: kept while it is away, delivered in order, none twice, and no training waits."""
+"""Delivery to MLflow: rows are kept while it is away and arrive in order and once; training never waits for it."""
 
 import threading
 from contextlib import closing
@@ -7,14 +7,14 @@ import pytest
 from requests import ConnectionError as NoConnection
 
 from learner.tracking import delivery as delivery_module
-from learner.tracking.delivery import Delivery, insist
+from learner.tracking.delivery import Delivery, retry
 from learner.tracking.journal import Journal, PushedMark, Row
 
 ROWS = [Row(100 * i, 1_700_000_000_000 + i, {"a": float(i)}) for i in range(12)]
 
 
 class Server:
-    """Takes rows while it is up; implements the part of Tracker that delivery needs."""
+    """Takes rows while it is up; implements the methods of Tracker that Delivery calls."""
 
     def __init__(self):
         self.rows, self.up, self.calls = [], True, 0
@@ -68,21 +68,21 @@ def write(journal, rows):
     return journal.sync()
 
 
-def test_rows_arrive_once_covered(delivery, server, journal, mark):
+def test_rows_are_delivered_once_a_checkpoint_covers_them(delivery, server, journal, mark):
     offset = write(journal, ROWS[:3])
     write(journal, ROWS[3:5])  # not covered by a checkpoint yet
-    delivery.up_to(offset)
+    delivery.deliver_up_to(offset)
     assert delivery.flush(30) is None
     assert server.rows == ROWS[:3] and mark.read() == offset
-    delivery.up_to(journal.sync())
+    delivery.deliver_up_to(journal.sync())
     assert delivery.flush(30) is None
     assert server.rows == ROWS[:5]
 
 
-def test_rows_of_an_outage_arrive_later_in_order_and_once(delivery, server, journal, said):
+def test_rows_of_an_outage_are_delivered_after_it_in_order_and_once(delivery, server, journal, said):
     server.up = False
     for i in range(0, 12, 3):
-        delivery.up_to(write(journal, ROWS[i : i + 3]))
+        delivery.deliver_up_to(write(journal, ROWS[i : i + 3]))
     assert delivery.flush(0.2) == "connection refused"
     assert server.rows == [] and server.calls >= 2
     server.up = True
@@ -91,20 +91,20 @@ def test_rows_of_an_outage_arrive_later_in_order_and_once(delivery, server, jour
     assert len(said) == 2 and "kept and sent again: connection refused" in said[0] and "none is missing" in said[1]
 
 
-def test_asking_does_not_wait_for_a_server_that_hangs(delivery, server, journal):
+def test_a_request_does_not_wait_for_a_server_that_hangs(delivery, server, journal):
     server.busy.clear()
     for row in ROWS:
-        delivery.up_to(write(journal, [row]))  # returns, or the test times out
+        delivery.deliver_up_to(write(journal, [row]))  # returns, or the test times out
     server.busy.set()
     assert delivery.flush(30) is None
     assert server.rows == ROWS
 
 
-def test_what_a_closed_delivery_still_brings_does_not_count(server, journal, mark, said, monkeypatch):
-    monkeypatch.setattr(delivery_module, "LAST_WAIT_S", 0.01)
+def test_rows_of_a_request_in_flight_at_the_close_do_not_count(server, journal, mark, said, monkeypatch):
+    monkeypatch.setattr(delivery_module, "CLOSE_TIMEOUT_S", 0.01)
     delivery = Delivery(server, journal, mark, said.append)
     server.busy.clear()
-    delivery.up_to(write(journal, ROWS[:2]))
+    delivery.deliver_up_to(write(journal, ROWS[:2]))
     while not server.calls:
         threading.Event().wait(0.01)
     delivery.close()
@@ -112,34 +112,34 @@ def test_what_a_closed_delivery_still_brings_does_not_count(server, journal, mar
     delivery._thread.join(30)
     assert mark.read() == 0
     with closing(Delivery(server, journal, mark, said.append)) as successor:
-        successor.up_to(journal.sync())
+        successor.deliver_up_to(journal.sync())
         assert successor.flush(30) is None
     assert server.rows == ROWS[:2] * 2  # the same rows with the same times, which MLflow stores once
 
 
-def test_a_call_is_insisted_on_until_it_works(said):
+def test_a_call_is_retried_until_it_works(said):
     failures = iter([NoConnection("away"), NoConnection("away")])
 
     def call():
         for failure in failures:
             raise failure
 
-    insist(call, "the results", 30, said.append)
+    retry(call, "the results", 30, said.append)
     assert said == ["MLflow did not take the results, trying again: away"] * 2
 
 
-def test_without_patience_the_error_comes_out(said):
+def test_with_no_time_left_the_error_is_raised(said):
     def call():
         raise NoConnection("away")
 
     with pytest.raises(NoConnection):
-        insist(call, "the results", 0, said.append)
+        retry(call, "the results", 0, said.append)
     assert said == []
 
 
-def test_errors_that_are_not_mlflows_come_out_at_once(said):
+def test_errors_of_other_kinds_are_raised_at_once(said):
     def call():
         raise IsADirectoryError("ours")
 
     with pytest.raises(IsADirectoryError):
-        insist(call, "the artifacts", 30, said.append)
+        retry(call, "the artifacts", 30, said.append)

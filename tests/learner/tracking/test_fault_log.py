@@ -1,4 +1,4 @@
-"""The log of faults: whole lines come back, half ones of killed drivers do not."""
+"""The log of faults: entries round-trip, and half-written lines of killed drivers are skipped."""
 
 from actors.service.fault_policy import Action, Component, ComponentFailed, ComponentKind, Decision, Fault, Recovered
 from learner.tracking.fault_log import FaultLog, read_faults
@@ -6,7 +6,7 @@ from learner.tracking.fault_log import FaultLog, read_faults
 WORKER = Component(ComponentKind.WORKER, 2)
 
 
-def test_events_come_back_in_order(tmp_path):
+def test_entries_round_trip_in_order(tmp_path):
     path = tmp_path / "run" / "faults.jsonl"
     log = FaultLog(path)
     log.failed(ComponentFailed(WORKER, 0, Fault.LATE, "silent"), Decision(Action.RESTART, 2))
@@ -21,13 +21,13 @@ def test_events_come_back_in_order(tmp_path):
     assert sorted(entry.time_s for entry in entries) == [entry.time_s for entry in entries]
 
 
-def test_half_a_line_does_not_count_nor_spoil_the_rest(tmp_path):
+def test_a_half_written_line_is_skipped_and_spoils_no_other(tmp_path):
     path = tmp_path / "faults.jsonl"
     assert read_faults(path) == []
     FaultLog(path).resumed()
     whole = path.read_text()
     path.write_text(whole + whole[:20])
     assert len(read_faults(path)) == 1
-    FaultLog(path).resumed()  # its line stands behind the half one
+    FaultLog(path).resumed()  # its line is appended to the half-written one
     FaultLog(path).resumed()
     assert len(read_faults(path)) == 2

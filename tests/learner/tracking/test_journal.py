@@ -1,10 +1,10 @@
-"""The journal of metrics: cut back to what a checkpoint knows, and never shorter."""
+"""The journal of metrics: truncated to what a checkpoint covers, and refused if it is shorter."""
 
 import json
 
 import pytest
 
-from learner.tracking.journal import Journal, PushedMark, Row, charted, read_rows
+from learner.tracking.journal import Journal, PushedMark, Row, mlflow_metrics, read_rows
 from sim_core.checks import ConfigError
 
 ROWS = [Row(100 * i, 1_700_000_000_000 + i, {"a/b": i / 3, "c": float(i)}) for i in range(5)]
@@ -16,7 +16,7 @@ def path(tmp_path):
 
 
 def write(path, rows, offset=0):
-    """Appends rows; the offset after them."""
+    """Appends rows; returns the offset after them."""
     journal = Journal(path, offset)
     for row in rows:
         journal.append(row)
@@ -32,11 +32,11 @@ def read(path, offset):
     return rows
 
 
-def test_rows_come_back_exactly(path):
+def test_rows_round_trip_exactly(path):
     assert read(path, write(path, ROWS)) == ROWS
 
 
-def test_offsets_are_the_files_length_and_mark_rows(path):
+def test_offsets_are_lengths_of_the_file_between_rows(path):
     journal = Journal(path, 0)
     offsets = [journal.sync()]
     for row in ROWS:
@@ -50,14 +50,14 @@ def test_offsets_are_the_files_length_and_mark_rows(path):
     assert offsets[0] == 0 and len(path.read_text().splitlines()) == 5
 
 
-def test_rows_are_seen_before_they_are_synced(path):
+def test_rows_are_visible_before_they_are_synced(path):
     journal = Journal(path, 0)
     journal.append(ROWS[0])
     assert journal.rows() == ROWS[:1]
     journal.close()
 
 
-def test_what_was_written_after_the_checkpoint_is_cut_off(path):
+def test_rows_after_the_checkpoint_are_truncated(path):
     offset = write(path, ROWS[:2])
     write(path, ROWS[2:4], offset)
     with path.open("ab") as file:
@@ -67,19 +67,19 @@ def test_what_was_written_after_the_checkpoint_is_cut_off(path):
     assert [Row(*json.loads(line)) for line in path.read_text().splitlines()] == [*ROWS[:2], ROWS[4]]
 
 
-def test_a_fresh_start_drops_everything(path):
+def test_a_fresh_start_truncates_everything(path):
     write(path, ROWS)
     assert read(path, 0) == []
 
 
-def test_a_journal_shorter_than_its_checkpoint_knows_is_refused(path):
+def test_a_journal_shorter_than_its_checkpoint_needs_is_refused(path):
     offset = write(path, ROWS)
     with pytest.raises(ConfigError, match=str(offset + 1)):
         Journal(path, offset + 1)
     assert path.stat().st_size == offset
 
 
-def test_the_mark_outlives_a_restart(tmp_path):
+def test_the_mark_survives_a_restart(tmp_path):
     path = tmp_path / "metrics.pushed"
     mark = PushedMark(path, 500)
     assert mark.read() == 0
@@ -88,11 +88,11 @@ def test_the_mark_outlives_a_restart(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["metrics.pushed"]
 
 
-def test_a_mark_beyond_the_journal_does_not_count(tmp_path):
+def test_a_mark_beyond_the_journal_is_lowered(tmp_path):
     path = tmp_path / "metrics.pushed"
     PushedMark(path, 500).write(321)
     assert PushedMark(path, 100).read() == 100
-    assert PushedMark(path, 500).read() == 100  # rows written after the cut were never pushed
+    assert PushedMark(path, 500).read() == 100  # rows written after the truncation were never pushed
 
 
 @pytest.mark.parametrize("text", ["", "x", "12 34"])
@@ -102,7 +102,7 @@ def test_an_unreadable_mark_pushes_everything_again(tmp_path, text):
     assert PushedMark(path, 500).read() == 0
 
 
-def test_rows_are_read_while_they_are_written(tmp_path):
+def test_rows_are_read_while_another_process_writes(tmp_path):
     path = tmp_path / "metrics.jsonl"
     assert read_rows(path) == []
     journal = Journal(path, 0)
@@ -110,13 +110,13 @@ def test_rows_are_read_while_they_are_written(tmp_path):
     assert read_rows(path) == [Row(1, 2, {"a": 0.5})]
     journal.close()
     with path.open("ab") as file:
-        file.write(b'[3, 4, {"a"')  # a row of which a part is written
+        file.write(b'[3, 4, {"a"')  # a half-written row
     assert read_rows(path) == [Row(1, 2, {"a": 0.5})]
 
 
-def test_mlflow_gets_no_accounts_and_no_interval_but_the_results():
+def test_mlflow_gets_no_accounts_and_only_the_intervals_of_the_result():
     kept = {"final/success_rate": 0.5, "final/success_rate_low": 0.4, "final/return_high": 2.0, "eval/lost_rate": 0.1}
     kept |= {"time/worker_waits": 0.1, "time/learner_samples": 0.2}
     names = "account/produced replay/size policy/staleness_s eval/success_rate_low eval/return_high final/lost_rate_low"
     names += " time/worker_acts train/td_error"
-    assert charted(kept | dict.fromkeys(names.split(), 1.0)) == kept
+    assert mlflow_metrics(kept | dict.fromkeys(names.split(), 1.0)) == kept

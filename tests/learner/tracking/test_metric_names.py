@@ -9,7 +9,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from learner.config import RunConfig
 from learner.loop import TrainingLoop
-from learner.tracking.journal import Journal, charted
+from learner.tracking.journal import Journal, mlflow_metrics
 from learner.tracking.metric_names import ENV_STEPS, METRICS
 from learner.training.cluster import ProcessCluster
 from tests.checkpointing import Silent
@@ -18,7 +18,7 @@ README = Path(__file__).parents[3] / "learner" / "README.md"
 
 
 def journal_names(config: RunConfig, folder: Path) -> set[str]:
-    """Names of all metrics that a run in one process leaves in its journal."""
+    """Names of all metrics in the journal of a run in one process."""
     with closing(Journal(folder / "metrics.jsonl", 0)) as journal:
         loop = TrainingLoop(config, ProcessCluster(config, 0), journal, folder / "checkpoints", Silent(), bool)
         assert loop.run()
@@ -27,7 +27,7 @@ def journal_names(config: RunConfig, folder: Path) -> set[str]:
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory, small_run):
-    """What runs of our environment and of one without outcomes measure together."""
+    """Names from a run of our environment and a run of one without outcomes."""
     plain = dict(
         engine="process",
         total_env_steps=2_000,
@@ -44,11 +44,11 @@ def written(tmp_path_factory, small_run):
     return journal_names(ours, tmp_path_factory.mktemp("ours")) | journal_names(other, tmp_path_factory.mktemp("other"))
 
 
-def test_the_table_has_every_metric_of_the_journal_and_no_other(written):
+def test_the_table_lists_exactly_the_metrics_of_the_journal(written):
     assert {known.journal for known in METRICS} - {ENV_STEPS} == written
 
 
-def test_names_are_prometheus_names_and_stand_once():
+def test_names_are_valid_in_prometheus_and_unique():
     for of in ("journal", "name", "series"):
         assert len({getattr(known, of) for known in METRICS}) == len(METRICS)
     for known in METRICS:
@@ -64,7 +64,7 @@ def in_mlflow(journal: str) -> str:
     """What the README says of a metric: whether MLflow has it, whose step is the count of env steps."""
     if journal == ENV_STEPS:
         return "step"
-    return "yes" if charted({journal: 0.0}) else ""
+    return "yes" if mlflow_metrics({journal: 0.0}) else ""
 
 
 def test_the_readme_has_the_table():

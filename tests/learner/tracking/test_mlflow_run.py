@@ -1,4 +1,4 @@
-"""The MLflow side of a run, with a real store in a file."""
+"""A run in MLflow, with a real store in a file."""
 
 import dataclasses
 import math
@@ -55,7 +55,7 @@ def test_params_are_complete_and_flat(tracker, small_run):
     assert len(flat_params(small_run)) == len(dataclasses.fields(RunConfig)) - 1 + len(dataclasses.fields(WorldConfig))
 
 
-def test_tags_say_what_a_user_filters_by(tracker, small_run, store):
+def test_tags_hold_what_a_user_filters_by(tracker, small_run, store):
     tags = run_of(tracker).data.tags
     expected = {"method": "sensor", "robots": "3", "groups": "2", "seed": "3", "engine": "process"}
     assert expected.items() <= tags.items()
@@ -87,7 +87,7 @@ def test_many_metrics_go_in_several_requests(tracker):
     tracker.push([])
 
 
-def test_what_is_no_number_is_left_out(tracker):
+def test_values_that_are_not_finite_are_left_out(tracker):
     tracker.push([Row(1, 1_700_000_000_000, {"a": math.nan, "b": math.inf, "c": 2.0})])
     assert run_of(tracker).data.metrics == {"c": 2.0}
 
@@ -97,8 +97,8 @@ def test_accounts_stay_in_the_journal(tracker):
     assert run_of(tracker).data.metrics.keys() == {"train/loss"}
 
 
-def test_final_results_stand_at_step_0(tracker):
-    tracker.final({"success_rate": 0.75}, 1_700_000_000_000)
+def test_results_are_logged_at_step_0(tracker):
+    tracker.log_results({"success_rate": 0.75}, 1_700_000_000_000)
     assert history(tracker, "final/success_rate") == [(0, 1_700_000_000_000, 0.75)]
 
 
@@ -136,8 +136,8 @@ def test_files_and_folders_become_artifacts(tracker, tmp_path):
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "curve.png").write_bytes(b"png")
     (tmp_path / "report.html").write_text("<html>")
-    tracker.artifact(tmp_path / "figures")
-    tracker.artifact(tmp_path / "report.html")
+    tracker.log_artifact(tmp_path / "figures")
+    tracker.log_artifact(tmp_path / "report.html")
     client = mlflow.MlflowClient(tracker.uri)
     assert sorted(file.path for file in client.list_artifacts(tracker.run_id)) == ["figures", "report.html"]
     assert [file.path for file in client.list_artifacts(tracker.run_id, "figures")] == ["figures/curve.png"]
@@ -164,14 +164,14 @@ def test_the_logged_policy_gives_the_same_values(tracker, policy, small_run):
     assert mlflow.active_run() is None
 
 
-def test_the_registry_has_every_run_once_and_the_best_under_an_alias(store, policy, small_run):
+def test_the_registry_has_one_version_a_run_and_an_alias_for_the_best(store, policy, small_run):
     weights, shape = policy
     config = dataclasses.replace(small_run, world=dataclasses.replace(small_run.world, robots=4, groups=3))
     runs = {}
     for score in (0.5, 0.75, 0.25, 0.75):
         tracker = Tracker(store[0], "registry", store[1])
         tracker.start(config)
-        for _ in range(2):  # as when the server fails after the first
+        for _ in range(2):  # as if the server had failed after the first call
             tracker.log_policy(weights, config, shape, score)
         runs[tracker.run_id] = score
     client = mlflow.MlflowClient(store[0])
@@ -190,7 +190,7 @@ def test_the_episodes_of_training_and_evaluation_are_datasets(store, small_run):
     def logged(config):
         tracker = Tracker(store[0], "datasets", store[1])
         tracker.start(config)
-        tracker.log_inputs(config)  # as a sweep's cell does that goes on
+        tracker.log_inputs(config)  # as a resumed cell of a sweep does
         inputs = run_of(tracker).inputs.dataset_inputs
         return {entry.tags[0].value: (entry.dataset.name, entry.dataset.digest) for entry in inputs}
 
@@ -202,7 +202,7 @@ def test_the_episodes_of_training_and_evaluation_are_datasets(store, small_run):
 
 
 @pytest.mark.parametrize("uri", ["http://127.0.0.1:9", "https://127.0.0.1:9", "http://no-such-host.invalid"])
-def test_a_server_that_does_not_answer_is_refused_quickly(uri):
+def test_a_server_that_does_not_answer_is_refused_at_once(uri):
     start_s = time.monotonic()
     with pytest.raises(ConfigError, match="no MLflow server answers.*mlflow server"):
         Tracker(uri, "tests", None)
@@ -236,7 +236,7 @@ def test_a_store_that_cannot_be_opened_is_refused(uri, tmp_path, monkeypatch):
         "$(touch touched);`touch touched`",
     ],
 )
-def test_a_store_that_cannot_be_is_refused_without_its_password(uri, tmp_path, monkeypatch, capfd):
+def test_an_unusable_store_is_refused_without_showing_its_password(uri, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError) as caught:
         Tracker(uri, "tests", None)

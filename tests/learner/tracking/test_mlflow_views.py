@@ -1,11 +1,13 @@
-"""Views of a sweep's experiment: what they name is what runs log, and the UI can unpack them."""
+"""Views of a sweep's experiment: they name what runs log, in the format that the installed MLflow UI reads."""
 
 import base64
 import json
 import zlib
+from pathlib import Path
 
 import mlflow
 import pytest
+from mlflow.utils.validation import MAX_EXPERIMENT_TAG_VAL_LENGTH
 
 from learner.config import RunConfig, flat_params
 from learner.tracking.mlflow_run import Tracker
@@ -39,6 +41,16 @@ def test_a_view_shows_what_runs_log(key):
         assert {group["groupByData"] for group in state["groupBy"]["groupByKeys"]} <= params
     uuids = [chart["uuid"] for chart in state["compareRunCharts"]]
     assert len(uuids) == len(set(uuids)) and len(name) > 0
+
+
+@pytest.mark.parametrize("key", sweep_views())
+def test_a_packed_view_fits_into_a_tag(key):
+    assert len(packed_view(*sweep_views()[key], 10**13)) <= MAX_EXPERIMENT_TAG_VAL_LENGTH
+
+
+def test_the_installed_ui_reads_views_from_this_tag():
+    scripts = (Path(mlflow.__file__).parent / "server/js/build/static/js").glob("*.js")
+    assert any(TAG in script.read_text() for script in scripts)
 
 
 def test_a_packed_view_unpacks_to_itself():

@@ -1,4 +1,4 @@
-"""Passwords in addresses are neither shown nor stored."""
+"""Passwords in tracking URIs are neither shown nor stored."""
 
 import pytest
 
@@ -27,12 +27,12 @@ def test_a_password_is_not_shown(uri, shown):
 
 
 @pytest.mark.parametrize("secret", ["s3cr%40et", "s3cr@et"])
-def test_what_a_client_says_is_shown_without_it(secret):
+def test_client_errors_are_shown_without_the_password(secret):
     text = f"API request to http://me:{secret}@host:5000/api failed"
     assert hide_secrets(text, SECRET) == "API request to http://me:***@host:5000/api failed"
 
 
-def test_a_stored_address_gets_its_password_from_the_environment(monkeypatch):
+def test_a_stored_uri_gets_its_password_from_the_environment(monkeypatch):
     assert full_uri("http://host") == "http://host"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", SECRET)
     assert full_uri(public_uri(SECRET)) == SECRET
