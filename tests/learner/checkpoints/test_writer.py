@@ -8,13 +8,13 @@ import fsspec
 import pytest
 
 from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, Fault
-from actors.service.rpc import LocalCalls
+from actors.service.rpc import LocalCalls, Placed
 from actors.storage.fragment_writer import FragmentWriter
 from actors.storage.uri import check_writable, fetched, join_location, parse_location
 from learner.checkpoints.checkpoint import Retention, newest_valid
 from learner.checkpoints.manifest import CheckpointError, UnusableCheckpointError
 from learner.checkpoints.retention import Score
-from learner.checkpoints.writer import CheckpointWriter, RunPosition, SavingComponent
+from learner.checkpoints.writer import CheckpointWriter, RunPosition
 from sim_core.checks import ConfigError
 
 
@@ -53,7 +53,7 @@ class Run:
         self.nodes = {name: Node(name) for name in ("learner", "worker")}
         components = (Component(ComponentKind.LEARNER), Component(ComponentKind.WORKER, 3))
         pairs = zip(components, self.nodes.values(), strict=True)
-        self.components = [SavingComponent(component, 7, node) for component, node in pairs]
+        self.components = [Placed(component, 7, node) for component, node in pairs]
         self.writer = CheckpointWriter(root, LocalCalls(), 60.0)
         self.scores = []
 
