@@ -35,9 +35,9 @@ def log_artifacts(
     tracker: Tracker,
     result: RunResult,
     rows: list[Row],
-    say: Callable[[str], None],
+    message: Callable[[str], None],
 ) -> None:
-    """Writes all artifacts of a finished run and uploads them to MLflow; says so where there is no animation."""
+    """Writes all artifacts of a finished run and uploads them to MLflow; reports by `message` if one is left out."""
     assert result.weights is not None and result.evaluation is not None
     folder.artifacts.mkdir(exist_ok=True)
     written = [folder.path / CONFIG, _curve(folder, config, [*rows, _last_row(result)])]
@@ -49,7 +49,7 @@ def log_artifacts(
             check_video_packages()
             written += foreign_animation(config, result.weights, config.final_eval_first_seed, path)
         except ConfigError as error:
-            say(f"no animation: {error}")
+            message(f"no animation: {error}")
     for path in written:
         tracker.log_artifact(path)
     tracker.log_policy(result.weights, config, env_shape(config.env), score(result.evaluation))

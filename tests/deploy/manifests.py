@@ -97,3 +97,14 @@ def _validator(kind: str) -> Draft202012Validator:
 def crd_errors(document) -> list[str]:
     """Errors of a document against KubeRay's definition of its kind."""
     return [f"{error.json_path}: {error.message}" for error in _validator(document["kind"]).iter_errors(document)]
+
+
+def with_misspelt(document, path, wrong: str):
+    """A copy in which the field at the end of `path`, keys and indices, is called `wrong`."""
+    changed = copy.deepcopy(document)
+    *parents, last = path
+    parent = changed
+    for step in parents:
+        parent = parent[step]
+    parent[wrong] = parent.pop(last)
+    return changed

@@ -10,7 +10,7 @@ import pytest
 from ray.autoscaler._private.util import prepare_config, validate_config
 from ray.scripts.scripts import start as ray_start
 
-from tests.deploy.manifests import ROOT, read_yaml
+from tests.deploy.manifests import ROOT, read_yaml, with_misspelt
 from tests.deploy.project import image_ray_version
 
 (CONFIG,) = read_yaml(ROOT / "deploy" / "ray-cluster.yml")
@@ -32,28 +32,21 @@ def test_ray_accepts_the_cluster_file():
 
 
 @pytest.mark.parametrize(
-    ("way", "name", "wrong"),
+    ("path", "wrong"),
     [
-        ((), "setup_commands", "set_up_commands"),
-        ((), "head_start_ray_commands", "head_start_commands"),
-        (("auth",), "ssh_private_key", "ssh_key"),
+        (("setup_commands",), "set_up_commands"),
+        (("head_start_ray_commands",), "head_start_commands"),
+        (("auth", "ssh_private_key"), "ssh_key"),
     ],
 )
-def test_a_misspelt_field_is_found(way, name, wrong):
-    config = copy.deepcopy(CONFIG)
-    place = config
-    for step in way:
-        place = place[step]
-    place[wrong] = place.pop(name)
+def test_a_misspelt_field_is_found(path, wrong):
     with pytest.raises(jsonschema.ValidationError, match=wrong):
-        check(config)
+        check(with_misspelt(CONFIG, path, wrong))
 
 
 def test_a_misspelt_address_is_found():
-    config = copy.deepcopy(CONFIG)
-    config["provider"]["head_ips"] = config["provider"].pop("head_ip")
     with pytest.raises(click.ClickException, match="head_ip"):
-        check(config)
+        check(with_misspelt(CONFIG, ("provider", "head_ip"), "head_ips"))
 
 
 @pytest.mark.parametrize("name", ["head_start_ray_commands", "worker_start_ray_commands"])

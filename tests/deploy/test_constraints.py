@@ -1,4 +1,4 @@
-"""That the committed releases are those of pyproject.toml's requirements, and fit any machine."""
+"""The constraints file: it satisfies pyproject.toml's requirements, and its releases install on any machine."""
 
 import importlib.util
 import re
@@ -33,7 +33,7 @@ def installed_extras():
 
 
 def requirements(extras):
-    """What pyproject.toml requires with some extras, those that an extra names included."""
+    """The requirements of pyproject.toml with some extras, including the extras that an extra names."""
     optional = project()["optional-dependencies"]
     found = [Requirement(line) for line in project()["dependencies"]]
     found += [Requirement(line) for extra in extras for line in optional[extra]]
@@ -42,9 +42,9 @@ def requirements(extras):
     return [requirement for requirement in found if requirement.name != "shoal"]
 
 
-def test_every_line_is_one_release_of_one_package_that_any_machine_finds():
+def test_every_line_pins_one_public_release_of_one_package():
     for line in FILE.read_text().splitlines()[1:]:
-        assert re.fullmatch(r"[a-z0-9-]+==[0-9][0-9a-z.!]*", line), line  # no place, no local version
+        assert re.fullmatch(r"[a-z0-9-]+==[0-9][0-9a-z.!]*", line), line  # no address, no local version
     names = [name for name, _ in pinned()]
     assert names == sorted(set(names)) and names == [canonicalize_name(name) for name in names]
     assert not [name for name in names if name.startswith(constraints().CUDA)], "a build for CPUs needs none of them"
@@ -63,12 +63,12 @@ def test_the_extras_are_those_that_the_makefile_installs():
 
 
 @pytest.mark.parametrize("extra", ["dashboard", "export", "s3", "video"])
-def test_the_developers_extra_has_those_of_every_command(extra):
+def test_the_developers_extra_includes_the_extras_of_all_commands(extra):
     (own,) = [line for line in project()["optional-dependencies"]["dev"] if line.startswith("shoal")]
     assert extra in Requirement(own).extras
 
 
-def test_a_report_of_pip_becomes_lines():
+def test_a_report_of_pip_is_turned_into_pins():
     found = [
         ("Foo_Bar.baz", "1.0"),
         ("torch", "2.13.0+cpu"),

@@ -25,6 +25,7 @@ from tests.deploy.manifests import (
     crd_errors,
     documents,
     pod_templates,
+    with_misspelt,
 )
 from tests.deploy.project import free_port, image_ray_version, project
 
@@ -55,17 +56,6 @@ def test_ray_objects_fit_kuberays_schema(name):
     assert not crd_errors(RAY[name])
 
 
-def spoilt(document, path, wrong):
-    """A copy in which the field at the end of `path` is called `wrong`."""
-    changed = copy.deepcopy(document)
-    *way, last = path
-    place = changed
-    for step in way:
-        place = place[step]
-    place[wrong] = place.pop(last)
-    return changed
-
-
 CONTAINER = ("template", "spec", "containers", 0)
 
 
@@ -80,14 +70,14 @@ CONTAINER = ("template", "spec", "containers", 0)
 )
 def test_a_misspelt_field_of_a_core_object_is_found(name, path, wrong):
     with pytest.raises(kubernetes_validate.ValidationError, match=wrong):
-        check_core(spoilt(CORE[name], path, wrong))
+        check_core(with_misspelt(CORE[name], path, wrong))
 
 
 @pytest.mark.parametrize("name", RAY)
 @pytest.mark.parametrize("field", ["resources", "volumeMounts"])
 def test_a_misspelt_field_of_a_pod_is_found(name, field):
     way = ("spec",) if name == "RayCluster/shoal" else ("spec", "rayClusterSpec")
-    document = spoilt(RAY[name], (*way, "workerGroupSpecs", 0, *CONTAINER, field), f"{field}x")
+    document = with_misspelt(RAY[name], (*way, "workerGroupSpecs", 0, *CONTAINER, field), f"{field}x")
     with pytest.raises(kubernetes_validate.ValidationError, match=f"{field}x"):
         check_pods(document)
 
@@ -106,7 +96,7 @@ def test_a_misspelt_field_of_a_pod_is_found(name, field):
     ],
 )
 def test_a_misspelt_field_of_a_ray_object_is_found(name, path, wrong):
-    assert any(wrong in error for error in crd_errors(spoilt(RAY[name], path, wrong)))
+    assert any(wrong in error for error in crd_errors(with_misspelt(RAY[name], path, wrong)))
 
 
 @needs_crds
