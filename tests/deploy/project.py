@@ -1,7 +1,6 @@
-"""What tests of deployment files need to know of the project and the machine."""
+"""What tests of deployment files need to know of the project."""
 
 import io
-import socket
 import tomllib
 from pathlib import Path
 
@@ -26,10 +25,3 @@ def image_ray_version() -> str:
     """The Ray that the image holds."""
     (value,) = [value for name, value in instructions() if name == "ARG" and value.startswith("RAY_VERSION=")]
     return value.partition("=")[2]
-
-
-def free_port() -> int:
-    """A port of the loopback that nothing listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
