@@ -12,7 +12,7 @@ guard_ray(joins=False)  # as `shoal` does: Ray reads this once, when the first t
 
 BUCKET = "shoal-tests"
 INDEPENDENT = ("test_faults.py", "test_peers.py", "test_process_run.py", "test_ray_run.py")
-"""Integration tests that are long and share no fixture: they run in any process, not in one for all of a module."""
+"""Integration tests that are long and share no fixture outside of a class: each may run in another process."""
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -22,8 +22,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     class ByModule(LoadScopeScheduling):  # type: ignore[misc]
         def _split_scope(self, nodeid: str) -> str:
-            module = nodeid.partition("::")[0]
-            return nodeid if module.removeprefix("tests/integration/") in INDEPENDENT else module
+            module, test_or_class, *_ = nodeid.split("::")
+            is_divided = module.removeprefix("tests/integration/") in INDEPENDENT
+            return f"{module}::{test_or_class}" if is_divided else module
 
     return ByModule(config, log)
 
