@@ -10,7 +10,7 @@ INSTALL := $(PIP) --constraint .ci/constraints.txt --editable
 # Python compiles the modules that it imports, once. pip would compile all, which takes longer than a first training saves.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: train test check bench bench-peers bench-exactness reproduce fuzz soak lint types kernels constraints setup clean
+.PHONY: train test lint style types kernels constraints bench bench-peers bench-exactness reproduce fuzz soak setup clean
 
 setup: $(READY)
 
@@ -31,15 +31,26 @@ $(READY): pyproject.toml .ci/constraints.txt | $(BIN)/python
 train: $(RUNTIME)
 	$(BIN)/shoal train $(ARGS)
 
-lint: $(READY)
+# Style, types and import rules.
+lint: style types
+
+style: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-# Lint, types, import rules, then all tests. ARGS goes to pytest.
-test: lint
-	$(BIN)/python -m pytest $(ARGS)
+kernels: $(READY)
+	$(BIN)/python -m tests.precompile
+
+# Style, types, import rules, then all tests. ARGS goes to pytest, which runs WORKERS processes: more than two cores,
+# since tests with a Ray wait for half of their time.
+WORKERS ?= 4
+test: style
+	$(MAKE) --no-print-directory --jobs 2 types kernels
+	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder $(ARGS)
 
 # Renews .ci/constraints.txt: the newest releases that pyproject.toml admits. ARGS="torch==2.13.0" holds one back.
 constraints: $(BIN)/python

@@ -9,6 +9,7 @@ The sources in `__pycache__` do not count: they are copies of users' own methods
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any
 
 import numba
 from numba import njit
+from numba.core.caching import IndexDataCacheFile
 
 JIT_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": True, "_nrt": False}
 """On-disk cache, IEEE division, no fastmath. Without numba's run-time (NRT) a kernel cannot allocate memory."""
@@ -46,13 +48,29 @@ CACHE_FOLDER = _cache_folder()
 """The folder of this version's compiled kernels."""
 
 
+class LockedCacheFile(IndexDataCacheFile):
+    """The cached signatures of one kernel, which several processes may save at once.
+
+    Numba's own class locks nothing: two processes that save different signatures can choose the same file name, and a
+    third one then loads the code of the wrong signature.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        """Saves the code of one signature."""
+        with open(f"{self._index_path}.lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            super().save(key, data)
+
+
 def _compiled(function: Any, **options: Any) -> Any:
     previous = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = CACHE_FOLDER  # read when the dispatcher is created; other users of numba keep theirs
     try:
-        return njit(**(JIT_OPTIONS | options))(function)
+        made = njit(**(JIT_OPTIONS | options))(function)
     finally:
         numba.config.CACHE_DIR = previous
+    made._cache._cache_file.__class__ = LockedCacheFile
+    return made
 
 
 def kernel(function: Any) -> Any:

@@ -1,7 +1,8 @@
-"""What all tests share: a process that any of them may start Ray in, and a real S3 server (moto's)."""
+"""What all tests share: a process that any of them may start Ray in, its share of the tests, and moto's S3 server."""
 
 import os
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -10,6 +11,28 @@ from learner.ray_backend.auth import guard_ray
 guard_ray(joins=False)  # as `shoal` does: Ray reads this once, when the first test module imports it
 
 BUCKET = "shoal-tests"
+INDEPENDENT = ("test_faults.py", "test_peers.py", "test_process_run.py", "test_ray_run.py")
+"""Integration tests that are long and share no fixture outside of a class: each may run in another process."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Shares modules out among pytest-xdist's processes, so that each makes a module's fixtures once."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByModule(LoadScopeScheduling):  # type: ignore[misc]
+        def _split_scope(self, nodeid: str) -> str:
+            module, test_or_class, *_ = nodeid.split("::")
+            is_divided = module.removeprefix("tests/integration/") in INDEPENDENT
+            return f"{module}::{test_or_class}" if is_divided else module
+
+    return ByModule(config, log)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Begins with the longest tests in pytest-xdist's processes: those with a Ray, then other slow ones."""
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: [item.get_closest_marker(name) is None for name in ("ray", "slow")])
 
 
 @pytest.fixture(scope="session")

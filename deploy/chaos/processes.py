@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import secrets
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from urllib.error import URLError
 from urllib.request import urlopen
@@ -17,6 +19,8 @@ import psutil
 
 START_S = 180.0
 """Time limit for a process to start, on a busy machine."""
+PORTS = range(20_000, 32_768)
+"""Above the ports of Ray's workers, below those of outgoing connections: a server that restarts finds its port free."""
 TITLES = {
     "rollout worker": "ray::RolloutNode",
     "replay shard": "ray::ShardNode",
@@ -28,10 +32,11 @@ TITLES = {
 
 def free_port() -> int:
     """A port of the loopback interface that is free now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    while True:
+        port = secrets.choice(PORTS)
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
 
 
 class TrackingServer:

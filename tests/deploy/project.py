@@ -1,7 +1,6 @@
 """Facts about the project and the machine, for tests of deployment files."""
 
 import io
-import socket
 import tomllib
 from pathlib import Path
 
@@ -26,10 +25,3 @@ def image_ray_version() -> str:
     """Ray's version in the image."""
     (value,) = [value for name, value in instructions() if name == "ARG" and value.startswith("RAY_VERSION=")]
     return value.partition("=")[2]
-
-
-def free_port() -> int:
-    """A free port of the loopback interface."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]

@@ -14,6 +14,7 @@ import pytest
 from packaging.requirements import Requirement
 from ray.scripts.scripts import start as ray_start
 
+from deploy.chaos.processes import free_port
 from deploy.cli import parse
 from deploy.options.training import Sweep
 from tests.deploy.manifests import (
@@ -27,7 +28,7 @@ from tests.deploy.manifests import (
     pod_templates,
     with_misspelt,
 )
-from tests.deploy.project import free_port, image_ray_version, project
+from tests.deploy.project import image_ray_version, project
 
 DOCUMENTS = documents()
 RAY = {name: document for name, document in DOCUMENTS.items() if document["kind"] in RAY_KINDS}

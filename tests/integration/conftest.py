@@ -1,6 +1,7 @@
 """Small runs for integration tests."""
 
 import dataclasses
+import functools
 import os
 import subprocess
 import sys
@@ -45,19 +46,20 @@ def small() -> RunConfig:
 @pytest.fixture
 def shoal(tmp_path: Path):
     """Runs the command `shoal` in a process of its own, in an empty folder."""
+    return functools.partial(run_shoal, tmp_path)
 
-    def run(*arguments: str, timeout_s: float = 240.0) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "deploy", *arguments],
-            cwd=tmp_path,
-            env=clean_environment(),
-            capture_output=True,
-            text=True,
-            timeout=timeout_s,
-            check=False,
-        )
 
-    return run
+def run_shoal(folder: Path, *arguments: str, timeout_s: float = 240.0) -> subprocess.CompletedProcess[str]:
+    """The command `shoal`, run in `folder` in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "deploy", *arguments],
+        cwd=folder,
+        env=clean_environment(),
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        check=False,
+    )
 
 
 def clean_environment() -> dict[str, str]:

@@ -1,7 +1,6 @@
 """A head node as `ray start --head` makes it, nodes that join it, and jobs that `shoal submit` gives it."""
 
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
@@ -14,6 +13,7 @@ from typing import NamedTuple
 import psutil
 import requests
 
+from deploy.chaos.processes import free_port
 from learner.config import RunConfig
 from tests.integration.conftest import clean_environment, flags
 from tests.integration.jobs import wait_for
@@ -26,16 +26,6 @@ NODE_PORTS = (
     "runtime-env-agent-port",
     "metrics-export-port",
 )
-
-
-def free_ports(count: int) -> list[int]:
-    sockets = [socket.socket() for _ in range(count)]
-    for each in sockets:
-        each.bind(("127.0.0.1", 0))
-    ports = [each.getsockname()[1] for each in sockets]
-    for each in sockets:
-        each.close()
-    return ports
 
 
 class Head(NamedTuple):
@@ -87,7 +77,10 @@ def ray_start(log: Path, *words: str, auth: dict[str, str], before: Sequence[str
 
 
 def with_free_ports(*names: str) -> dict[str, int]:
-    return dict(zip(names, free_ports(len(names)), strict=True))
+    ports: set[int] = set()
+    while len(ports) < len(names):
+        ports.add(free_port())
+    return dict(zip(names, ports, strict=True))
 
 
 def as_flags(ports: dict[str, int]) -> list[str]:

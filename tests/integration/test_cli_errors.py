@@ -3,13 +3,13 @@
 import dataclasses
 import json
 import shutil
-import socket
 from pathlib import Path
 
 import pytest
 import torch
 
 from actors.storage.fragment_writer import file_sum
+from deploy.chaos.processes import free_port
 from deploy.cli import main, parse
 from learner.checkpoints.manifest import decode_manifest, encode_manifest
 from learner.presets import preset_config
@@ -23,12 +23,6 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
     except SystemExit as stop:  # tyro's way out
         code = stop.code if isinstance(stop.code, int) else 1
     return code, capsys.readouterr().err
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.mark.parametrize(

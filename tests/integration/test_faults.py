@@ -8,6 +8,7 @@ import pytest
 
 from deploy.chaos.invariants import broken_invariants
 from deploy.chaos.processes import TrackingServer
+from deploy.cli import main
 from learner.run_folder import RunFolder
 from learner.tracking.journal import PushedMark
 from tests.integration.conftest import SMALL, flags
@@ -67,7 +68,7 @@ def test_a_run_reaches_its_target_whatever_is_killed(shoal):
     assert learned and float(learned[1]) > 40, done.stdout  # undisturbed, three seeds gave 65 to 95
 
 
-def test_a_used_folder_is_refused(shoal, tmp_path):
+def test_a_used_folder_is_refused(tmp_path, capsys):
     (tmp_path / "chaos" / "run").mkdir(parents=True)
-    done = shoal("chaos", "--out", "chaos")
-    assert done.returncode == 2 and "name another --out" in done.stderr
+    assert main(["chaos", "--out", str(tmp_path / "chaos")]) == 2
+    assert "name another --out" in capsys.readouterr().err

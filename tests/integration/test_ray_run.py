@@ -12,10 +12,10 @@ import pytest
 import zarr
 from safetensors.numpy import load_file
 
-from learner.checkpoints.checkpoint import newest_valid
-from learner.config import flat_params, to_dict
+from learner.checkpoints.checkpoint import Checkpoint, newest_valid
+from learner.config import RunConfig, flat_params, to_dict
 from learner.ray_backend.cluster import COLLECTS_IN_FLIGHT, PUSHES_IN_FLIGHT
-from tests.integration.conftest import SMALL, flags
+from tests.integration.conftest import SMALL, flags, run_shoal
 from tests.integration.jobs import Job
 
 pytestmark = [
@@ -45,44 +45,62 @@ def assert_history_is_the_journal(folder: Path, run: str) -> None:
         assert len(history) >= (1 if key.startswith("eval/") else 2)  # a checkpoint that is due holds up the next one
 
 
-def test_a_run_over_ray_leaves_everything_a_user_compares(shoal, tmp_path):
-    config = dataclasses.replace(SMALL, engine="ray", workers=2, replay_shards=2, replay_placement="actors")
-    done = shoal("train", "--name", "r", *flags(config))
-    assert done.returncode == 0, done.stderr
-    for word in ("success rate", "MLflow UI", "checkpoint", "curve", "animation"):
-        assert word in done.stdout
-    client, run = the_run(tmp_path)
-    assert run.info.status == "FINISHED"
-    assert run.info.run_name == "sensor 3r×2g s0"
-    assert run.data.params == {key: str(value) for key, value in flat_params(config).items()}
-    tags = {name: run.data.tags[name] for name in ("method", "robots", "groups", "seed", "engine")}
-    assert tags == {"method": "sensor", "robots": "3", "groups": "2", "seed": "0", "engine": "ray"}
-    assert len(run.data.tags["mlflow.source.git.commit"]) in (40, len("unknown"))
-    assert len(run.data.metrics) < 30
-    for key in (
-        "final/success_rate_low",
-        "train/q_mean",
-        "time/learner_waits",
-        "time/worker_waits",
-        "policy/staleness_updates",
-        "eval/return",
-    ):
-        assert key in run.data.metrics
-    artifacts = {item.path for item in client.list_artifacts(run.info.run_id)}
-    assert artifacts == {"config.json", "learning_curve.png", "episode.html", "episode.zarr"}
-    models = client.search_logged_models([run.info.experiment_id])
-    assert [model.source_run_id for model in models] == [run.info.run_id]
-    assert_history_is_the_journal(tmp_path, "r")
-    assert json.loads((tmp_path / "runs/r/config.json").read_text()) == json.loads(json.dumps(to_dict(config)))
+SPREAD = dataclasses.replace(SMALL, engine="ray", workers=2, replay_shards=2, replay_placement="actors")
 
 
-@pytest.mark.parametrize("replay", ["uniform", "prioritised"])
-def test_every_transition_is_accounted_for(shoal, tmp_path, replay):
-    config = dataclasses.replace(SMALL, engine="ray", workers=2, replay_shards=2, replay_placement="actors")
-    config = dataclasses.replace(config, replay=replay, network="dueling" if replay == "prioritised" else "plain")
+class TestAFinishedRun:
+    @pytest.fixture(scope="class")
+    def finished(self, tmp_path_factory: pytest.TempPathFactory):
+        """(folder, outcome of the command) of a run with two workers and two shards of their own."""
+        folder = tmp_path_factory.mktemp("finished")
+        done = run_shoal(folder, "train", "--name", "r", *flags(SPREAD))
+        assert done.returncode == 0, done.stderr
+        return folder, done
+
+    def test_a_run_over_ray_leaves_everything_a_user_compares(self, finished):
+        folder, done = finished
+        for word in ("success rate", "MLflow UI", "checkpoint", "curve", "animation"):
+            assert word in done.stdout
+        client, run = the_run(folder)
+        assert run.info.status == "FINISHED"
+        assert run.info.run_name == "sensor 3r×2g s0"
+        assert run.data.params == {key: str(value) for key, value in flat_params(SPREAD).items()}
+        tags = {name: run.data.tags[name] for name in ("method", "robots", "groups", "seed", "engine")}
+        assert tags == {"method": "sensor", "robots": "3", "groups": "2", "seed": "0", "engine": "ray"}
+        assert len(run.data.tags["mlflow.source.git.commit"]) in (40, len("unknown"))
+        assert len(run.data.metrics) < 30
+        for key in (
+            "final/success_rate_low",
+            "train/q_mean",
+            "time/learner_waits",
+            "time/worker_waits",
+            "policy/staleness_updates",
+            "eval/return",
+        ):
+            assert key in run.data.metrics
+        artifacts = {item.path for item in client.list_artifacts(run.info.run_id)}
+        assert artifacts == {"config.json", "learning_curve.png", "episode.html", "episode.zarr"}
+        models = client.search_logged_models([run.info.experiment_id])
+        assert [model.source_run_id for model in models] == [run.info.run_id]
+        assert_history_is_the_journal(folder, "r")
+        assert json.loads((folder / "runs/r/config.json").read_text()) == json.loads(json.dumps(to_dict(SPREAD)))
+
+    def test_every_transition_is_accounted_for(self, finished):
+        folder, _ = finished
+        assert_transitions_are_accounted_for(newest_valid(folder / "runs/r/checkpoints")[0], SPREAD)
+
+
+def test_every_transition_of_prioritised_replay_is_accounted_for(shoal, tmp_path):
+    config = dataclasses.replace(SPREAD, replay="prioritised", network="dueling")
     done = shoal("train", "--name", "r", *flags(config))
     assert done.returncode == 0, done.stderr
     checkpoint, _ = newest_valid(tmp_path / "runs/r/checkpoints")
+    assert_transitions_are_accounted_for(checkpoint, config)
+    assert_priorities_came_back(checkpoint.folder, checkpoint.state["learner"]["shards"])
+
+
+def assert_transitions_are_accounted_for(checkpoint: Checkpoint, config: RunConfig) -> None:
+    """Every transition that the workers made is in a shard or still in a worker, and samples keep the pace."""
     state = checkpoint.state
     shards = state["learner"]["shards"]
     waiting = [load_file(checkpoint.folder / f"worker-{i}.safetensors")["nstep_waits"].sum() for i in range(2)]
@@ -96,8 +114,6 @@ def test_every_transition_is_accounted_for(shoal, tmp_path, replay):
     blocks = config.workers * (COLLECTS_IN_FLIGHT + PUSHES_IN_FLIGHT)
     band = 2 * config.batch_size * config.updates_per_call + blocks * config.block_env_steps * config.samples_per_insert
     assert 0 <= ahead - config.min_replay * config.samples_per_insert <= band
-    if replay == "prioritised":
-        assert_priorities_came_back(checkpoint.folder, shards)
 
 
 def assert_priorities_came_back(folder: Path, shards: list) -> None:

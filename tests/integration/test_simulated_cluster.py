@@ -17,11 +17,11 @@ import promql_parser
 import pytest
 import yaml
 
+from deploy.chaos.processes import free_port
 from learner.checkpoints.checkpoint import newest_valid
 from learner.tracking.metric_names import ENV_STEPS, METRICS
 from tests.dashboards.promql import alert_queries, dashboard, dashboard_queries
 from tests.deploy.manifests import PROMETHEUS
-from tests.deploy.project import free_port
 from tests.integration.conftest import SMALL, flags
 from tests.integration.simulated_cluster import CPUS, NODES, SimulatedCluster
 

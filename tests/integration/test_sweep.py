@@ -36,8 +36,10 @@ GRID += "--baselines greedy --baseline-episodes 10".split()
 COMMAND = ["sweep", *GRID, "--env-steps", "60000", "--name", "s"]
 
 
-def results_in_one_process(folder):
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory):
     """What the cells give when each is run in this process."""
+    folder = tmp_path_factory.mktemp("alone")
     uri = f"sqlite:///{folder / 'mlflow.db'}"
     Tracker(uri, "cells", str(folder / "artifacts"))
     place = SweepLocation(folder / "cells", uri, "cells")
@@ -46,7 +48,7 @@ def results_in_one_process(folder):
     return sorted(row for table in tables for row in read_table(table))
 
 
-def test_a_sweep_that_is_killed_twice_has_every_cell_once(shoal, tmp_path):
+def test_a_sweep_that_is_killed_twice_has_every_cell_once(shoal, rows, tmp_path):
     tables = "runs/sweeps/s/cells/*/results.csv"
     for cells_done in (3, 5):
         before = len(list(tmp_path.glob(tables)))
@@ -57,7 +59,7 @@ def test_a_sweep_that_is_killed_twice_has_every_cell_once(shoal, tmp_path):
     done = shoal(*COMMAND)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "8 of 8 cells" in done.stdout
-    assert read_table(tmp_path / "runs/sweeps/s/results.csv") == results_in_one_process(tmp_path / "alone")
+    assert read_table(tmp_path / "runs/sweeps/s/results.csv") == rows
 
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/runs/mlflow.db")
     experiment = client.get_experiment_by_name("sweep s")
@@ -71,8 +73,7 @@ def test_a_sweep_that_is_killed_twice_has_every_cell_once(shoal, tmp_path):
     assert len(client.search_runs([experiment.experiment_id])) == 8
 
 
-def test_cells_of_an_earlier_sitting_are_not_run_again(capsys, tmp_path, monkeypatch):
-    rows = results_in_one_process(tmp_path / "alone")
+def test_cells_of_an_earlier_sitting_are_not_run_again(rows, capsys, tmp_path, monkeypatch):
     known = tmp_path / "known.csv"
     write_table(known, rows)
     monkeypatch.chdir(tmp_path)
@@ -88,8 +89,7 @@ def results_of(folder, *arguments):
     return read_table(folder / "runs/sweeps/s/results.csv")
 
 
-def test_a_smaller_grid_of_the_same_name_leaves_the_others_results(capsys, tmp_path):
-    rows = results_in_one_process(tmp_path / "alone")
+def test_a_smaller_grid_of_the_same_name_leaves_the_others_results(rows, capsys, tmp_path):
     write_table(tmp_path / "known.csv", rows)
     assert results_of(tmp_path, *COMMAND[1:], "--known", str(tmp_path / "known.csv")) == rows
     assert results_of(tmp_path, *COMMAND[1:]) == rows, "the folder's own table is known"
@@ -98,8 +98,7 @@ def test_a_smaller_grid_of_the_same_name_leaves_the_others_results(capsys, tmp_p
     assert "4 of 4 cells" in capsys.readouterr().out
 
 
-def test_results_of_former_settings_are_left_out(tmp_path):
-    rows = results_in_one_process(tmp_path / "alone")
+def test_results_of_former_settings_are_left_out(rows, tmp_path):
     former = [row._replace(config="0" * 12) for row in rows]
     write_table(tmp_path / "known.csv", [*former, *rows])
     assert results_of(tmp_path, *COMMAND[1:], "--known", str(tmp_path / "known.csv")) == rows

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numba
@@ -15,7 +16,7 @@ from numba.core.errors import NumbaError
 
 import sim_core
 from sim_core import jit
-from sim_core.jit import inlined, kernel
+from sim_core.jit import LockedCacheFile, inlined, kernel
 
 ROOT = Path(sim_core.__file__).parents[1]
 
@@ -150,6 +151,21 @@ def test_kernels_are_cached_beside_the_sources_or_in_the_users_cache(monkeypatch
     assert Path(jit._cache_folder()).parent == Path.home() / ".cache" / "shoal"
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
     assert Path(jit._cache_folder()).parent == tmp_path
+
+
+def test_signatures_that_are_saved_at_once_keep_their_own_code(tmp_path):
+    def save(i):
+        LockedCacheFile(str(tmp_path), "kernel", "stamp").save(f"signature {i}", f"code {i}")
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(save, range(100)))
+    cache = LockedCacheFile(str(tmp_path), "kernel", "stamp")
+    assert [cache.load(f"signature {i}") for i in range(100)] == [f"code {i}" for i in range(100)]
+
+
+def test_kernels_are_saved_under_the_lock():
+    for made in (kernel(lambda x: x + 1), inlined(lambda x: x + 1)):
+        assert type(made._cache._cache_file) is LockedCacheFile
 
 
 def _makes_an_array(x):
