@@ -78,7 +78,9 @@ def _exportable(command: Export, config: RunConfig, weights: WeightsSnapshot) ->
     load_snapshot(network, weights)
     if command.bare:
         states = observed_states(config.env, weights, command.first_seed, command.states)
-        return _Exportable(BarePolicy(network), bare_inputs(shape), bare_outputs(shape), states)
+        world = config.world
+        names = world.method_class.observation_names(world) if config.env.is_swarm else ()
+        return _Exportable(BarePolicy(network), bare_inputs(shape, names), bare_outputs(shape), states)
     world = config.world
     states = swarm_states(world, weights, weights, command.first_seed, command.states)
     robot = make_robot(network, world)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,12 +29,13 @@ class Port(NamedTuple):
         return {**self._asdict(), "shape": list(self.shape)}
 
 
-def bare_inputs(shape: EnvShape) -> list[Port]:
-    """What a bare policy takes."""
+def bare_inputs(shape: EnvShape, names: Sequence[str] = ()) -> list[Port]:
+    """What a bare policy takes; `names` are those of an observation's elements, where they are known."""
     space = shape.observation_space
     assert space.dtype is not None
     dtype = np.dtype(space.dtype).name
-    return [Port("observation", dtype, ("batch", *space.shape), "", "as the environment gives it")]
+    meaning = "as the environment gives it" + (f": {', '.join(names)}" if names else "")
+    return [Port("observation", dtype, ("batch", *space.shape), "", meaning)]
 
 
 def bare_outputs(shape: EnvShape) -> list[Port]:

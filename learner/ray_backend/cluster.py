@@ -91,7 +91,7 @@ def _as_fault(error: Exception) -> Exception:
     """The fault that an error of Ray stands for; an error that our own code raised, unchanged."""
     if isinstance(error, RayTaskError):
         cause = getattr(error, "cause", None)
-        if isinstance(cause, CallFailed | ComponentFailed):
+        if isinstance(cause, CallFailed | ComponentFailed | ConfigError):  # ConfigError: of a user's own method
             return cause
         return _as_fault(cause) if isinstance(cause, RayError) else error
     for kinds, fault in FAULTS:

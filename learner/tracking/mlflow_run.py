@@ -261,7 +261,7 @@ class Tracker:
 
 def _param_text(name: str, value: object) -> str:
     """The value of a param; for a user's own file its checksum, since MLflow limits the length of params."""
-    is_file = name.endswith("_source") and value
+    is_file = name == "sources" and value
     return f"sha256:{hashlib.sha256(str(value).encode()).hexdigest()[:16]}" if is_file else str(value)
 
 

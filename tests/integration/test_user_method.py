@@ -11,6 +11,7 @@ import pytest
 
 from actors.evaluation.result_table import read_table
 from deploy.cli import main
+from deploy.report_data.sources import find_report_source
 from learner.config import RunConfig
 from learner.run_folder import RunFolder
 from sim_core.plugins import METHODS
@@ -68,7 +69,9 @@ def test_its_policy_and_its_rule_are_evaluated_and_watched(trained, files, tmp_p
     assert "Corridor 6+3r" in (tmp_path / "e.html").read_text()
     assert main(["watch", str(trained.path), "--format", "png", "--out", str(tmp_path / "e.png")]) == 0
     assert main(["dashboard", str(trained.path), "--out", str(tmp_path / "d.html")]) == 0
-    assert "Compass" in (tmp_path / "d.html").read_text()
+    assert (tmp_path / "d.html").stat().st_size > 100_000
+    contents = find_report_source(str(trained.path), tmp_path).contents()
+    assert "Compass" in contents.subtitle and {group.method for group in contents.groups} == {"Compass"}
 
 
 def test_its_policy_is_exported_from_the_observation_on(trained, tmp_path, capsys):
@@ -106,7 +109,7 @@ def test_a_sweep_and_its_report_have_it_beside_the_dissertations_methods(files, 
     assert transferred == {(1, 2), (2, 1)}, "its state fits any number of groups"
     assert main(["report", str(table), "--out", "report"]) == 0
     assert main(["dashboard", "s", "--out", "s.html"]) == 0
-    assert "Compass" in Path("s.html").read_text() and "Compass" in Path("report/README.md").read_text()
+    assert "Compass" in Path("s.html").read_text() and "Compass" in Path("report/report.md").read_text()
 
 
 LATE = """
