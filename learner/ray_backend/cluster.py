@@ -123,8 +123,8 @@ class RayCalls:
     def wait(self, refs: list[Ref[T]], timeout_s: float) -> list[Ref[T]]:
         """Blocks until one of `refs` is there or the time is over; returns those that are there, in the given order."""
         ray.wait(refs, num_returns=1, timeout=timeout_s, fetch_local=False)
-        ready, _ = ray.wait(refs, num_returns=len(refs), timeout=0, fetch_local=False)
-        return [ref for ref in refs if ref in set(ready)]
+        ready = set(ray.wait(refs, num_returns=len(refs), timeout=0, fetch_local=False)[0])
+        return [ref for ref in refs if ref in ready]
 
     def get(self, ref: Ref[T]) -> T:
         """The result behind `ref`.
@@ -218,8 +218,8 @@ def connect(cpus: int, address: str | None) -> None:
     if have < cpus:
         leave()
         raise ConfigError(
-            f"the run needs {cpus} CPUs (one a rollout worker, shard actor and learner), the cluster has {have}: "
-            "lower workers or replay_shards, or add nodes"
+            f"the run needs {cpus} CPUs (one each for a rollout worker, a shard actor and the learner), "
+            f"the cluster has {have}: lower workers or replay_shards, or add nodes"
         )
 
 

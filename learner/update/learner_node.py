@@ -120,7 +120,7 @@ class LearnerNode:
         """The result of a call of the shard of this index.
 
         Raises:
-          ComponentFailed: the shard failed; no update has been made since the call.
+          ComponentFailed: the shard failed.
         """
         try:
             return self._calls.get(ref)
@@ -235,14 +235,14 @@ class LearnerNode:
         Raises:
           ComponentFailed: a shard failed, and all others have ended their writing.
         """
-        parts, failures = [self._writer.result(timeout_s)], []
+        results, failures = [self._writer.result(timeout_s)], []
         refs = [self._calls.start(shard, ShardNode.saved, timeout_s) for shard in self._shards]
         for i, ref in enumerate(refs):
             try:
-                parts.append(self._result(i, ref))
+                results.append(self._result(i, ref))
             except ComponentFailed as failure:
                 failures.append(failure)
-        written = join_results(parts)
+        written = join_results(results)
         if written is not None and failures:
             raise failures[0]
         return written
