@@ -40,6 +40,13 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return made(BOTH, tmp_path_factory.mktemp("both"))
 
 
+@pytest.fixture
+def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are drawn, but saved as empty files: for tests of names and texts."""
+    monkeypatch.setattr("deploy.commands.report.save_png", lambda figure, path: path.write_bytes(b""))
+
+
+@pytest.mark.usefixtures("unsaved")
 def test_one_preset_needs_no_folder_and_replaces_an_older_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "claims.md").write_text("old")
@@ -82,6 +89,7 @@ def test_refuses_a_missing_file(tmp_path: Path):
         report.run(Report(results=(tmp_path / "none.csv",), out=tmp_path / "out"))
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_several_tables_are_shown_side_by_side(both: dict[str, bytes], tmp_path: Path):
     tables = tuple(tmp_path / name for name in ("thesis.csv", "best.csv"))
     for table in tables:
@@ -93,6 +101,7 @@ def test_several_tables_are_shown_side_by_side(both: dict[str, bytes], tmp_path:
     assert re.search(r"^\| 14 \| .* \| holds \(10 of 10\) \| no data \(1 of 10\) \|$", page, re.MULTILINE)
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_policy_in_two_tables_counts_once_and_is_refused_if_they_differ(tmp_path: Path):
     rows = claimed_table()
     write_table(tmp_path / "results.csv", rows)
@@ -111,6 +120,7 @@ def test_settings_that_do_not_fit_the_diagrams_leave_the_report_complete(changed
     assert set(made(rows, tmp_path)) == COMMON | {picture.file for picture in PICTURES}
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_presets_name_cannot_leave_the_folder(tmp_path: Path):
     names = ("../elsewhere", "thesis+a=[1, 2]", "thesis")
     made([row("sensor", Setup(5, 1), success=50, preset=name) for name in names], tmp_path, "deep/out")
