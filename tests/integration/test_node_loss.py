@@ -8,7 +8,7 @@ from ray.cluster_utils import Cluster
 
 from deploy.chaos.invariants import broken_invariants
 from learner.cluster_options import ClusterOptions
-from learner.run import execute
+from learner.run import RunSession
 from learner.run_folder import RunFolder, RunIdentity
 from learner.tracking.fault_log import read_faults
 from learner.tracking.mlflow_run import Tracker
@@ -65,7 +65,7 @@ def test_a_removed_node_costs_no_run(cluster, tmp_path):
     folder.save_identity(RunIdentity("r", tracker.uri, "faults", tracker.run_id))
     display = NodeRemover(remove, 5_000)
     options = ClusterOptions(cluster.address, 30.0, 200.0)
-    result = execute(folder, config, tracker, display, None, options, lambda result, rows: None)
+    result = RunSession(folder, config, tracker, display, options).execute(None, lambda result, rows: None)
     assert result.env_steps >= 30_000 and result.evaluation is not None, display.messages
     log = read_faults(folder.faults)
     assert {entry.event for entry in log} >= {"failed", "mended"}, display.messages
