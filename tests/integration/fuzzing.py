@@ -86,7 +86,7 @@ def workplace(folder: Path) -> Iterator[None]:
     (folder / "a-file").write_text("of no use")
     (folder / "results.csv").write_text("preset,policy\n")
     ports = {
-        deploy.training: ("execute", "Tracker"),
+        deploy.training: ("RunSession", "Tracker"),
         deploy.commands.train: ("Tracker",),
         deploy.commands.sweep: ("run_cells", "Tracker"),
         deploy.commands.evaluate: ("evaluate_in_tasks", "record_episode"),
