@@ -5,6 +5,7 @@ The same loop plays learned policies, which act greedily, and baselines.
 
 from __future__ import annotations
 
+import warnings
 from itertools import count, pairwise
 from typing import Any, NamedTuple
 
@@ -238,8 +239,12 @@ def record_frames(spec: EnvSpec, weights: WeightsSnapshot, seed: int) -> tuple[l
     """
     policy = Policy(weights)
     try:
-        env = gym.make(spec.env_id, render_mode="rgb_array")
+        with warnings.catch_warnings(action="ignore"):  # of an environment without this mode
+            env = gym.make(spec.env_id, render_mode="rgb_array")
     except (TypeError, gym.error.Error):
+        return [], 0.0
+    if "rgb_array" not in env.metadata.get("render_modes", []):
+        env.close()
         return [], 0.0
     frames_per_s = float(env.metadata.get("render_fps", 30))
     observation, _ = env.reset(seed=seed)

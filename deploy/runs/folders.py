@@ -20,7 +20,7 @@ JOB = "RAY_JOB_CONFIG_JSON_ENV_VAR"
 
 def default_name(config: RunConfig) -> str:
     """How names of runs with `config` begin, unless the user gives one."""
-    return config.name.replace("×", "").replace(" ", "-").replace("/", "-")
+    return re.sub(r"[^\w.+=-]+", "-", config.name.replace("×", ""))
 
 
 def default_sweep_name(grid: SweepConfig) -> str:

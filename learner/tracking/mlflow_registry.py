@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import re
 
 from mlflow import MlflowClient
 from mlflow.entities import Dataset, DatasetInput, InputTag
@@ -27,13 +28,11 @@ SCORE = "score"
 
 
 def model_name(config: RunConfig) -> str:
-    """Name of the registered model for a run's setup."""
+    """Name of the registered model for a run's setup; MLflow refuses `/` and `:`, which Gymnasium's ids may have."""
     world = config.world
-    return (
-        f"{world.method_name}-{world.robots}r-{world.groups}g"
-        if config.env.is_swarm
-        else config.env_id.replace("/", "-")
-    )
+    if config.env.is_swarm:
+        return f"{world.method_name}-{world.robots}r-{world.groups}g"
+    return re.sub(r"[/:]", "-", config.env_id)
 
 
 def register_policy(client: MlflowClient, config: RunConfig, run_id: str, logged: ModelInfo, score: float) -> None:
