@@ -5,8 +5,8 @@ Spec of the task (3.1, 4.1): success is the mean distance of the learning robot'
 Where two hold in one step, the first of collision, goal, lost or captured, timeout counts.
 
 M_sensor fails as soon as the learning robot senses no own robot, M_IN and M_OUT once it has been outside its
-group's ellipse for phi steps. A robot that fails so is captured if it senses, within R2, robots of other groups
-and none of its own; else it is lost. With `captured_is = surrounded` those others must also stand around it.
+group's ellipse for phi steps. A robot that fails in this way is captured if it senses, within R2, robots of other
+groups and none of its own; else it is lost. With `captured_is = surrounded` those others must also stand around it.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def _all_on_one_side(robot, edge, pos_x, pos_y, range_sq):
 
 @kernel
 def surrounded(robot, pos_x, pos_y, range_sq):
-    """Whether a robot stands inside the convex hull of those that it senses: none of them is the hull's edge to it."""
+    """Whether a robot stands inside the convex hull of those that it senses: none is a tangent point from it."""
     nobody = True
     for other in range(pos_x.shape[0]):
         dx, dy = pos_x[other] - pos_x[robot], pos_y[other] - pos_y[robot]

@@ -51,6 +51,8 @@ METHODS = Kind(
     },
 )
 """State representations: M_sensor (Chapter 3), M_IN and M_OUT (Chapter 4)."""
+DISSERTATION_METHODS = ("sensor", "in", "out")
+"""The three methods of the dissertation, in its order."""
 SCENES = Kind("scene", "sim_core.scenes.base:Scene", {"circle": "sim_core.scenes.circle:CircleScene"})
 """Start positions and goals."""
 

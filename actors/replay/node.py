@@ -92,15 +92,15 @@ class ShardNode:
         """Draws `count` rows."""
         return self.shard.sample(count)
 
-    def set_priorities(self, numbers: NDArray[np.int64], td_errors: NDArray[np.float32]) -> float:
+    def set_priorities(self, insertion_indices: NDArray[np.int64], td_errors: NDArray[np.float32]) -> float:
         """Sets the priorities of sampled rows (see PrioritisedShard.set_priorities); returns the shard's new mass.
 
         Args:
-          numbers: `Draws.number` of the rows, `[count]`.
+          insertion_indices: `Draws.insertion_index` of the rows, `[count]`.
           td_errors: `[count]`.
         """
         assert isinstance(self.shard, PrioritisedShard)
-        self.shard.set_priorities(numbers, td_errors)
+        self.shard.set_priorities(insertion_indices, td_errors)
         return self.shard.mass
 
     def mass(self) -> float:

@@ -78,7 +78,7 @@ class RolloutNode:
     Args:
       settings: see RolloutSettings.
       worker_id: position among the workers; the first push goes to the shard `worker_id` modulo their number.
-      incarnation: how often this worker was started before.
+      incarnation: distinguishes the starts of this worker; grows with each.
       calls: how to call the shards.
       shards: where to push to.
       pushes_in_flight: most pushes that are in flight when `collect` returns.

@@ -150,9 +150,10 @@ class RolloutWorker:
             self.set_weights(WeightsSnapshot(version, time_s, layers))
         if not isinstance(self._env, SwarmVectorEnv):
             return
-        worlds = {name[6:]: array for name, array in arrays.items() if name.startswith("world_")}
+        worlds = {name.removeprefix("world_"): array for name, array in arrays.items() if name.startswith("world_")}
         self._observation = self._env.worlds.set_state(worlds)
-        self._nstep.set_state({name[6:]: array for name, array in arrays.items() if name.startswith("nstep_")})
+        nstep = {name.removeprefix("nstep_"): array for name, array in arrays.items() if name.startswith("nstep_")}
+        self._nstep.set_state(nstep)
         self._length[:], self._return[:] = arrays["length"], arrays["return"]
 
 

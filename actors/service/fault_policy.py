@@ -11,11 +11,11 @@ from enum import StrEnum
 from typing import NamedTuple
 
 MAX_ATTEMPTS = 5
-"""Consecutive failures, with no successful call in between, after which the run gives up on a component."""
+"""Consecutive failures, with no successful call in between, that a run outlives; the next one ends it."""
 MAX_RETRIES = 2
 """Consecutive failures after which an unreachable component is replaced instead of retried."""
 GIVE_UP_S = 3_600.0
-"""Seconds without a successful call after which the run gives up on a component."""
+"""Seconds since the first of consecutive failures after which the run gives up on a component."""
 
 
 class ComponentKind(StrEnum):

@@ -1,7 +1,7 @@
 """Atomic replacement on a local disk: a reader of a path finds the old content or the new one, never half of either.
 
 New content is written beside its place, under a name that ends in `.part`, and renamed once it is whole. A crash leaves
-the old content and perhaps a `.part`, which the next write replaces.
+the old content and perhaps a `.part`: the next write replaces it, or pruning removes it where its name is random.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from sim_core.plugins import METHODS, load
+from sim_core.plugins import DISSERTATION_METHODS, METHODS, load
 
 
 class MethodStyle(NamedTuple):
@@ -33,8 +33,6 @@ STYLES = (
     MethodStyle("#56B4E9", "++", "P", "--other-3", "longdashdot", "cross"),
 )
 """Styles of the dissertation's methods in their order, then of others; Okabe and Ito's colours, and grey."""
-DISSERTATION = tuple(METHODS.built_in)[:3]
-"""M_sensor, M_IN and M_OUT."""
 
 
 def method_label(name: str) -> str:
@@ -44,12 +42,12 @@ def method_label(name: str) -> str:
 
 def method_style(name: str) -> MethodStyle:
     """The style of a method: fixed for the dissertation's methods, chosen by a hash of the name for others."""
-    if name in DISSERTATION:
-        return STYLES[DISSERTATION.index(name)]
-    others = STYLES[len(DISSERTATION) :]
+    if name in DISSERTATION_METHODS:
+        return STYLES[DISSERTATION_METHODS.index(name)]
+    others = STYLES[len(DISSERTATION_METHODS) :]
     return others[zlib.crc32(name.encode()) % len(others)]
 
 
 def in_order(names: Iterable[str]) -> list[str]:
     """The dissertation's three methods, then the other methods in `names`."""
-    return [*DISSERTATION, *sorted(set(names) - set(DISSERTATION))]
+    return [*DISSERTATION_METHODS, *sorted(set(names) - set(DISSERTATION_METHODS))]

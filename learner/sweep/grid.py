@@ -16,7 +16,7 @@ from learner.config import WHERE, RunConfig, identity_dict, to_dict
 from learner.presets import PresetName, preset_config
 from sim_core.checks import ConfigError, check_fields, require
 from sim_core.config import WorldConfig
-from sim_core.plugins import METHODS, load, read_source, short_name
+from sim_core.plugins import DISSERTATION_METHODS, METHODS, load, read_source, short_name
 
 BaselineName = Literal["fl-orca", "greedy", "random"]
 
@@ -31,7 +31,7 @@ class SweepConfig:
 
     preset: PresetName = "thesis"
     """Settings of every training: those of the dissertation, or our best."""
-    methods: tuple[str, ...] = ("sensor", "in", "out")
+    methods: tuple[str, ...] = DISSERTATION_METHODS
     """State representations: names, or FILE.py:CLASS."""
     set: tuple[str, ...] = ()
     """Settings that override the preset's, as NAME=VALUE: any field of `shoal train`, for calibration."""
@@ -86,7 +86,7 @@ class SweepConfig:
 
 
 SET_BY_GRID = (
-    "world seed engine device method method_source scene_source robots groups env_id total_env_steps "
+    "world seed engine device method sources robots groups env_id total_env_steps "
     "final_eval_episodes final_eval_first_seed"
 ).split()
 """Settings that the grid sets itself: no override may name them."""

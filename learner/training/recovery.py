@@ -1,8 +1,11 @@
 """Recovery of failed components: carries out what the decision table says, which is retry, restart, rebuild or stop.
 
-A dead replay shard, step by step: the learner's call or a worker's push fails (`ComponentFailed`);
-`actors.service.fault_policy.decide` answers RESTART; `Supervisor.recover` places an empty shard under a new
-incarnation, writes the lost transitions off, and announces the shard to the learner and to all rollout workers.
+A dead replay shard, step by step. By default shards live in the learner's process and die with it: then the run is
+rebuilt from the last checkpoint. A shard with a process of its own (`replay_placement = actors`) is noticed when the
+learner's call of it fails, or when a worker's push fails: the worker drops that block and reports the shard, and
+`check_push` makes a `ComponentFailed` of it. `actors.service.fault_policy.decide` answers RESTART.
+`Supervisor.recover` places an empty shard under a new incarnation, subtracts the samples that the lost transitions were
+still due, and announces the shard to the learner and to all rollout workers.
 """
 
 from __future__ import annotations

@@ -185,17 +185,17 @@ class LearnerNode:
         draws = [(chances[i], reply.draws) for i, reply in zip(drawn, replies, strict=True) if reply.draws is not None]
         if not draws:
             return Sample(columns, None, None)
-        number = np.concatenate([each.insertion_index for _, each in draws])[order]
+        index = np.concatenate([each.insertion_index for _, each in draws])[order]
         probability = np.concatenate([chance * each.probability for chance, each in draws])[order]
-        return Sample(columns, np.repeat(drawn, shares[drawn])[order], Draws(number, probability))
+        return Sample(columns, np.repeat(drawn, shares[drawn])[order], Draws(index, probability))
 
     def _update_priorities(self, sample: Sample) -> None:
         """Sends the TD errors of the updates to the shards that their rows came from."""
         assert sample.draws is not None
         for i in np.unique(sample.shard) if sample.shard is not None else [0]:
             rows = slice(None) if sample.shard is None else sample.shard == i
-            numbers, td_errors = sample.draws.insertion_index[rows], self._learner.td_errors[rows]
-            ref = self._calls.start(self._shards[i], ShardNode.set_priorities, numbers, td_errors)
+            indices, td_errors = sample.draws.insertion_index[rows], self._learner.td_errors[rows]
+            ref = self._calls.start(self._shards[i], ShardNode.set_priorities, indices, td_errors)
             self._priority_updates[int(i)] = ref
 
     def _await_priority_updates(self) -> None:

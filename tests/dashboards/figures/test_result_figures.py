@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 
 from actors.evaluation.statistics import rate
 from dashboards.analysis.aggregate import GROUPS, ROBOTS, SETUPS, Results, Setup
-from dashboards.analysis.methods import DISSERTATION, STYLES, method_style
+from dashboards.analysis.methods import STYLES, method_style
 from dashboards.figures.result_figures import (
     FIXED_STYLE,
     PICTURES,
@@ -28,6 +28,7 @@ from dashboards.figures.result_figures import (
     heatmap,
 )
 from dashboards.figures.style import new_figure, save_png
+from sim_core.plugins import DISSERTATION_METHODS
 from tests.dashboards.tables import IN_SUCCESS, OUT_SUCCESS, SENSOR_SUCCESS, claimed_table, fixed
 
 
@@ -140,7 +141,7 @@ def test_a_line_breaks_where_a_cell_is_missing():
 
 
 def test_heatmap_holds_every_number(results: Results):
-    for axes, method in zip(heatmap(results).axes, DISSERTATION, strict=True):
+    for axes, method in zip(heatmap(results).axes, DISSERTATION_METHODS, strict=True):
         table = {"sensor": SENSOR_SUCCESS, "out": OUT_SUCCESS}.get(method, dict.fromkeys(ROBOTS, (IN_SUCCESS,) * 5))
         written = {tuple(map(round, text.get_position())): text.get_text() for text in axes.texts[::2]}
         wanted = {(x, y): f"{table[n][x]:.1f}" for y, n in enumerate(ROBOTS) for x in range(5)}

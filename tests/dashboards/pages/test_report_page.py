@@ -12,12 +12,13 @@ import pytest
 from actors.evaluation.trajectory import Episode
 from dashboards.analysis.aggregate import GROUPS, ROBOTS, Results, Setup
 from dashboards.analysis.claims import judge
-from dashboards.analysis.methods import DISSERTATION, method_label
+from dashboards.analysis.methods import method_label
 from dashboards.pages.player import player_data
 from dashboards.pages.report_page import EpisodeGroup, ReportContents, TableSection, report_data, report_page
 from dashboards.plotly_charts.result_charts import failure_causes, heatmaps, transfers
 from dashboards.plotly_charts.run_charts import setup_curves, sweep_speeds
 from sim_core.config import WorldConfig
+from sim_core.plugins import DISSERTATION_METHODS
 from tests.dashboards.chromium import complaints, emulate_scheme, emulate_width, press, two_frames, wait_until
 from tests.dashboards.contrast import poor_texts
 from tests.dashboards.plotly_charts.test_charts import TRAININGS, counted
@@ -116,8 +117,8 @@ def test_the_title_is_escaped(page: Any):
 
 def test_heat_maps_draw_every_cell(page: Any):
     drawn = plots(page, "success")
-    assert [plot["title"] for plot in drawn] == [method_label(method) for method in DISSERTATION]
-    for plot, method in zip(drawn, DISSERTATION, strict=True):
+    assert [plot["title"] for plot in drawn] == [method_label(method) for method in DISSERTATION_METHODS]
+    for plot, method in zip(drawn, DISSERTATION_METHODS, strict=True):
         rates = [[counted_here(method, Setup(n, m)) for m in GROUPS] for n in ROBOTS]
         assert plot["data"][0]["z"] == [[pytest.approx(rate) for rate in line] for line in rates]
         texts = [f"{100 * rate:.1f}" for line in rates for rate in line]

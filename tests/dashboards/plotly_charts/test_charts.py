@@ -12,12 +12,13 @@ from plotly.colors import sample_colorscale
 
 from actors.evaluation.result_table import ResultRow
 from dashboards.analysis.aggregate import GROUPS, ROBOTS, Results, Setup
-from dashboards.analysis.methods import DISSERTATION, method_label
+from dashboards.analysis.methods import method_label
 from dashboards.analysis.trainings import CurvePoint, Speed, Training
 from dashboards.pages.assets import asset
 from dashboards.plotly_charts.chart import Chart
 from dashboards.plotly_charts.result_charts import failure_causes, heatmaps, transfers
 from dashboards.plotly_charts.run_charts import run_curves, run_speeds, setup_curves, sweep_speeds
+from sim_core.plugins import DISSERTATION_METHODS
 from tests.dashboards.tables import claimed_table, row
 
 ROWS = claimed_table(without=[row("out", Setup(15, 8), success=0)])
@@ -27,7 +28,7 @@ CURVE = [CurvePoint(1000 * i, 0.2 * i, 0.2 * i - 0.1, 0.2 * i + 0.1, FAILED) for
 SPEEDS = [Speed(1000 * i, 5000.0 + i, 100.0 + i) for i in range(1, 6)]
 TRAININGS = [
     Training(f"{method} {setup} s{seed}", method, setup, seed, CURVE, SPEEDS)
-    for method in DISSERTATION
+    for method in DISSERTATION_METHODS
     for setup in (Setup(10, 2), Setup(5, 1))
     for seed in (0, 1)
 ]
@@ -89,7 +90,7 @@ def test_every_choice_has_a_view_with_numbers(chart: Chart):
 
 def test_heat_maps_have_the_rates_of_the_table():
     view = heatmaps(PRESETS).views["thesis"]
-    for panel, method in zip(view.panels, DISSERTATION, strict=True):
+    for panel, method in zip(view.panels, DISSERTATION_METHODS, strict=True):
         heat = panel.figure["data"][0]
         for robots, line in zip(ROBOTS, heat["z"], strict=True):
             for groups, share in zip(GROUPS, line, strict=True):
@@ -136,7 +137,7 @@ def test_extrapolation_stands_beside_fixed():
 
 
 def test_failures_and_success_add_up_to_one():
-    for panel, method in zip(failure_causes(PRESETS).views["thesis"].panels, DISSERTATION, strict=True):
+    for panel, method in zip(failure_causes(PRESETS).views["thesis"].panels, DISSERTATION_METHODS, strict=True):
         bars = panel.figure["data"]
         assert [bar["name"] for bar in bars] == ["lost", "captured", "collision", "timeout"]
         assert len({bar["marker"]["pattern"]["shape"] for bar in bars}) == 4  # they differ in more than colour
@@ -149,7 +150,7 @@ def test_failures_and_success_add_up_to_one():
 def test_curves_have_intervals_and_one_line_per_seed():
     figure = setup_curves(TRAININGS).views["5r×1g"].panels[0].figure
     assert [trace["name"] for trace in figure["data"][2::3]] == [
-        f"{name} seed {seed}" for name in map(method_label, DISSERTATION) for seed in (0, 1)
+        f"{name} seed {seed}" for name in map(method_label, DISSERTATION_METHODS) for seed in (0, 1)
     ]
     low, high, line = figure["data"][:3]
     assert (low["y"], line["y"], high["y"]) == tuple([getattr(p, f) for p in CURVE] for f in ("low", "value", "high"))
