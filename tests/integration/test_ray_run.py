@@ -15,7 +15,7 @@ from safetensors.numpy import load_file
 from learner.checkpoints.checkpoint import Checkpoint, newest_valid
 from learner.config import RunConfig, flat_params, to_dict
 from learner.ray_backend.cluster import COLLECTS_IN_FLIGHT, PUSHES_IN_FLIGHT
-from tests.integration.conftest import SMALL, flags, run_shoal
+from tests.integration.conftest import PATIENCE_S, SMALL, flags, run_shoal
 from tests.integration.jobs import Job
 
 pytestmark = [
@@ -151,7 +151,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(shoal, tmp_path):
     try:
         job.wait_for_checkpoints("r", 1)
         job.process.send_signal(signal.SIGINT)
-        assert job.process.wait(60) == 128 + signal.SIGINT, job.log.read_text()
+        assert job.process.wait(PATIENCE_S) == 128 + signal.SIGINT, job.log.read_text()
     finally:
         if job.process.poll() is None:
             job.kill_all()
