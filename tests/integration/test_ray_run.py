@@ -48,15 +48,16 @@ def assert_history_is_the_journal(folder: Path, run: str) -> None:
 SPREAD = dataclasses.replace(SMALL, engine="ray", workers=2, replay_shards=2, replay_placement="actors")
 
 
-class TestAFinishedRun:
-    @pytest.fixture(scope="class")
-    def finished(self, tmp_path_factory: pytest.TempPathFactory):
-        """(folder, outcome of the command) of a run with two workers and two shards of their own."""
-        folder = tmp_path_factory.mktemp("finished")
-        done = run_shoal(folder, "train", "--name", "r", *flags(SPREAD))
-        assert done.returncode == 0, done.stderr
-        return folder, done
+@pytest.fixture(scope="class")
+def finished(tmp_path_factory: pytest.TempPathFactory):
+    """(folder, outcome of the command) of a run with two workers and two shards of their own."""
+    folder = tmp_path_factory.mktemp("finished")
+    done = run_shoal(folder, "train", "--name", "r", *flags(SPREAD))
+    assert done.returncode == 0, done.stderr
+    return folder, done
 
+
+class TestAFinishedRun:
     def test_a_run_over_ray_leaves_everything_a_user_compares(self, finished):
         folder, done = finished
         for word in ("success rate", "MLflow UI", "checkpoint", "curve", "animation"):
