@@ -30,7 +30,7 @@ def open_chromium(profile: Path) -> Iterator[Any]:
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     chromium = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
-    chromium.set_script_timeout(120)  # for busy machines
+    chromium.set_script_timeout(600)  # for busy machines
     try:
         yield chromium
     finally:

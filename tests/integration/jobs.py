@@ -8,12 +8,12 @@ from pathlib import Path
 
 import psutil
 
-from tests.integration.conftest import clean_environment
+from tests.integration.conftest import PATIENCE_S, clean_environment
 
 
 def wait_for(condition: Callable[[], bool], log: Callable[[], str], process: subprocess.Popen) -> None:
-    """Waits until the condition holds; fails with the log when the process ends before, or after four minutes."""
-    deadline_s = time.monotonic() + 240
+    """Waits until the condition holds; fails with the log when the process ends before, or after `PATIENCE_S`."""
+    deadline_s = time.monotonic() + PATIENCE_S
     while not condition():
         assert process.poll() is None, log()
         assert time.monotonic() < deadline_s, log()
@@ -63,6 +63,6 @@ class Job:
         family = [driver, *driver.children(recursive=True)]
         for process in family:
             process.kill()
-        psutil.wait_procs(family, timeout=30)
-        self.process.wait(30)
+        psutil.wait_procs(family, timeout=PATIENCE_S)
+        self.process.wait(PATIENCE_S)
         assert len(family) > 3, "Ray runs in processes of its own"

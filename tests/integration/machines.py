@@ -17,7 +17,7 @@ from random import Random
 
 import pytest
 
-from tests.integration.conftest import clean_environment
+from tests.integration.conftest import PATIENCE_S, clean_environment
 from tests.integration.ray_head import ROOT
 
 TUN = Path("/dev/net/tun")
@@ -67,7 +67,7 @@ def on(machine: str, *words: str, auth: dict[str, str] | None = None, cwd: Path 
         cwd=cwd,
         capture_output=True,
         text=True,
-        timeout=200,
+        timeout=PATIENCE_S,
         check=False,
     )
 
@@ -109,7 +109,7 @@ class SlowCable:
 
     def close(self) -> None:
         self._process.stdin.close()
-        self._process.wait(30)
+        self._process.wait(PATIENCE_S)
         self._process.stdout.close()
 
 

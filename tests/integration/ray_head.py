@@ -15,7 +15,7 @@ import requests
 
 from deploy.chaos.processes import free_port
 from learner.config import RunConfig
-from tests.integration.conftest import clean_environment, flags
+from tests.integration.conftest import PATIENCE_S, clean_environment, flags
 from tests.integration.jobs import wait_for
 
 ROOT = Path(__file__).parents[2]
@@ -98,7 +98,7 @@ def end(process: subprocess.Popen) -> None:
     """Ends a node and what it started."""
     family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
     process.terminate()
-    process.wait(60)
+    process.wait(PATIENCE_S)
     for left in psutil.wait_procs(family, timeout=20)[1]:
         left.kill()
 
@@ -139,7 +139,7 @@ def kill(node: subprocess.Popen) -> None:
     """Takes a node, or a driver, away as a power cut does: all of its processes at once."""
     for process in [*psutil.Process(node.pid).children(recursive=True), psutil.Process(node.pid)]:
         process.kill()
-    node.wait(30)
+    node.wait(PATIENCE_S)
 
 
 def copy_of_the_code(folder: Path) -> Path:
@@ -175,4 +175,4 @@ def submit(head: Head, checkout: Path, config: RunConfig, runs: Path, log: Path,
 
 
 def finish(process: subprocess.Popen, log: Path) -> tuple[int, str]:
-    return process.wait(400), log.read_text()
+    return process.wait(PATIENCE_S), log.read_text()

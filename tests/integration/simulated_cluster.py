@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.integration.conftest import clean_environment
+from tests.integration.conftest import PATIENCE_S, clean_environment
 
 NODES = 3
 CPUS = 2
@@ -46,7 +46,7 @@ class SimulatedCluster:
         self.address = self._wait()["address"]
 
     def _wait(self):
-        deadline_s = time.monotonic() + 240
+        deadline_s = time.monotonic() + PATIENCE_S
         while not (self.folder / PLACE).is_file():
             assert self._process.poll() is None, self._log.read_text()
             assert time.monotonic() < deadline_s, self._log.read_text()
@@ -62,7 +62,7 @@ class SimulatedCluster:
     def close(self) -> None:
         """Ends all nodes."""
         self._process.stdin.close()
-        self._process.wait(120)
+        self._process.wait(PATIENCE_S)
         self._process.stdout.close()
 
 

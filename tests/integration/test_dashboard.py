@@ -32,7 +32,7 @@ from learner.tracking.mlflow_run import Tracker
 from learner.training.cluster import ProcessCluster
 from tests.dashboards.chromium import complaints, open_chromium, wait_until
 from tests.dashboards.pages.test_report_page import requested
-from tests.integration.conftest import SMALL, clean_environment
+from tests.integration.conftest import PATIENCE_S, SMALL, clean_environment
 from tests.integration.test_process_run import Silent
 
 pytestmark = [
@@ -106,7 +106,7 @@ def open_report(browser, url):
 
 
 def read(url):
-    with urllib.request.urlopen(url, timeout=60) as answer:
+    with urllib.request.urlopen(url, timeout=PATIENCE_S) as answer:
         return json.load(answer)
 
 
@@ -252,10 +252,10 @@ def test_ctrl_c_ends_a_server(trained, tmp_path, command):
     ) as process:
         try:
             url = re.match(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
-            with urllib.request.urlopen(url[0], timeout=60) as answer:
+            with urllib.request.urlopen(url[0], timeout=PATIENCE_S) as answer:
                 assert b"<canvas" in answer.read()
             process.send_signal(signal.SIGINT)
-            out, error = process.communicate(timeout=60)
+            out, error = process.communicate(timeout=PATIENCE_S)
         finally:
             process.kill()
     assert (process.returncode, out.strip(), error) == (0, "ended", "")

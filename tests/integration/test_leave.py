@@ -31,9 +31,9 @@ assert not ray.is_initialized()
 
 
 def has_gone(pid):
-    """Whether a process ends within ten seconds."""
+    """Whether a process ends within a minute, before it would end by itself."""
     try:
-        psutil.Process(pid).wait(timeout=10)
+        psutil.Process(pid).wait(timeout=60)
     except psutil.TimeoutExpired:
         return False
     except psutil.NoSuchProcess:
@@ -42,6 +42,6 @@ def has_gone(pid):
 
 
 def test_a_process_that_hangs_does_not_outlive_our_own_ray():
-    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert [has_gone(int(pid)) for pid in done.stdout.split()] == [True, True]

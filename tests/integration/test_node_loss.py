@@ -17,7 +17,6 @@ from tests.integration.conftest import SMALL
 pytestmark = [
     pytest.mark.ray,
     pytest.mark.slow,
-    pytest.mark.timeout(600),
     pytest.mark.filterwarnings("ignore"),  # of Ray's own cluster of nodes on one machine
 ]
 

@@ -17,7 +17,7 @@ from learner.loop import TrainingLoop
 from learner.tracking.journal import Journal
 from learner.training.cluster import ProcessCluster
 from tests.checkpointing import Silent
-from tests.integration.conftest import flags
+from tests.integration.conftest import PATIENCE_S, flags
 from tests.integration.jobs import Job
 
 pytestmark = pytest.mark.filterwarnings(
@@ -160,7 +160,7 @@ def test_sigterm_saves_and_the_run_goes_on(small, capsys, tmp_path):
     try:
         job.wait_for_checkpoints("r", 1)
         job.process.terminate()
-        assert job.process.wait(120) == 128 + signal.SIGTERM, job.log.read_text()
+        assert job.process.wait(PATIENCE_S) == 128 + signal.SIGTERM, job.log.read_text()
     finally:
         job.process.kill()
     output = job.log.read_text()

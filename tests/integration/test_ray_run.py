@@ -15,7 +15,7 @@ from safetensors.numpy import load_file
 from learner.checkpoints.checkpoint import Checkpoint, newest_valid
 from learner.config import RunConfig, flat_params, to_dict
 from learner.ray_backend.cluster import COLLECTS_IN_FLIGHT, PUSHES_IN_FLIGHT
-from tests.integration.conftest import SMALL, flags, run_shoal
+from tests.integration.conftest import PATIENCE_S, SMALL, flags, run_shoal
 from tests.integration.jobs import Job
 
 pytestmark = [
@@ -48,15 +48,16 @@ def assert_history_is_the_journal(folder: Path, run: str) -> None:
 SPREAD = dataclasses.replace(SMALL, engine="ray", workers=2, replay_shards=2, replay_placement="actors")
 
 
-class TestAFinishedRun:
-    @pytest.fixture(scope="class")
-    def finished(self, tmp_path_factory: pytest.TempPathFactory):
-        """(folder, outcome of the command) of a run with two workers and two shards of their own."""
-        folder = tmp_path_factory.mktemp("finished")
-        done = run_shoal(folder, "train", "--name", "r", *flags(SPREAD))
-        assert done.returncode == 0, done.stderr
-        return folder, done
+@pytest.fixture(scope="class")
+def finished(tmp_path_factory: pytest.TempPathFactory):
+    """(folder, outcome of the command) of a run with two workers and two shards of their own."""
+    folder = tmp_path_factory.mktemp("finished")
+    done = run_shoal(folder, "train", "--name", "r", *flags(SPREAD))
+    assert done.returncode == 0, done.stderr
+    return folder, done
 
+
+class TestAFinishedRun:
     def test_a_run_over_ray_leaves_everything_a_user_compares(self, finished):
         folder, done = finished
         for word in ("success rate", "MLflow UI", "checkpoint", "curve", "animation"):
@@ -151,7 +152,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(shoal, tmp_path):
     try:
         job.wait_for_checkpoints("r", 1)
         job.process.send_signal(signal.SIGINT)
-        assert job.process.wait(60) == 128 + signal.SIGINT, job.log.read_text()
+        assert job.process.wait(PATIENCE_S) == 128 + signal.SIGINT, job.log.read_text()
     finally:
         if job.process.poll() is None:
             job.kill_all()

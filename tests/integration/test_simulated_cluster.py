@@ -22,13 +22,12 @@ from learner.checkpoints.checkpoint import newest_valid
 from learner.tracking.metric_names import ENV_STEPS, METRICS
 from tests.dashboards.promql import alert_queries, dashboard, dashboard_queries
 from tests.deploy.manifests import PROMETHEUS
-from tests.integration.conftest import SMALL, flags
+from tests.integration.conftest import PATIENCE_S, SMALL, flags
 from tests.integration.simulated_cluster import CPUS, NODES, SimulatedCluster
 
 pytestmark = [
     pytest.mark.ray,
     pytest.mark.slow,
-    pytest.mark.timeout(900),
     pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:DeprecationWarning"),  # MLflow's own query
 ]
 
@@ -134,7 +133,7 @@ class Prometheus:
 
     def close(self) -> None:
         self._process.terminate()
-        self._process.wait(60)
+        self._process.wait(PATIENCE_S)
 
 
 @pytest.fixture
@@ -189,7 +188,7 @@ def test_a_real_prometheus_answers_every_query_with_the_runs_own_numbers(nodes, 
     try:
         open_questions = questions()
         assert len(open_questions) > 35
-        deadline_s = time.monotonic() + 400
+        deadline_s = time.monotonic() + PATIENCE_S
         while open_questions:
             assert job.poll() is None, (tmp_path / "job.log").read_text()
             assert time.monotonic() < deadline_s, f"no answer to {sorted(open_questions)}"
@@ -202,10 +201,10 @@ def test_a_real_prometheus_answers_every_query_with_the_runs_own_numbers(nodes, 
             assert time.monotonic() < deadline_s, "a node is never up"
             time.sleep(1)
         job.send_signal(signal.SIGINT)
-        assert job.wait(120) == 128 + signal.SIGINT, (tmp_path / "job.log").read_text()
+        assert job.wait(PATIENCE_S) == 128 + signal.SIGINT, (tmp_path / "job.log").read_text()
     finally:
         if job.poll() is None:
             job.kill()
-            job.wait(30)
+            job.wait(PATIENCE_S)
     rows = [json.loads(line) for line in (tmp_path / "runs/scraped/metrics.jsonl").read_text().splitlines()]
     assert_samples_are_the_journals(prometheus, rows)

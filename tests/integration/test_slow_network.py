@@ -14,7 +14,7 @@ from learner.checkpoints.checkpoint import finished_names
 from learner.checkpoints.store import env_steps_of
 from learner.run_folder import RunFolder
 from learner.tracking.fault_log import read_faults
-from tests.integration.conftest import SMALL, clean_environment, flags
+from tests.integration.conftest import PATIENCE_S, SMALL, clean_environment, flags
 from tests.integration.jobs import wait_for
 from tests.integration.machines import SlowCable, at, machines
 from tests.integration.ray_head import ROOT, end, kill, ray_start, short_folder, with_token
@@ -22,7 +22,6 @@ from tests.integration.ray_head import ROOT, end, kill, ray_start, short_folder,
 pytestmark = [
     pytest.mark.ray,
     pytest.mark.slow,
-    pytest.mark.timeout(900),
     pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:DeprecationWarning"),  # MLflow's own query
 ]
 
@@ -113,9 +112,9 @@ def test_a_run_outlives_a_slow_and_a_cut_cable(wired, tmp_path):
         before = steps(folder)
         wait_for_steps(folder, before + 2_000, job, log)
         cable.cut(LONG_S)
-        cluster.nodes[1].wait(60)  # it was given up, hears so and ends
+        cluster.nodes[1].wait(PATIENCE_S)  # it was given up, hears so and ends
         cluster.join()
-        assert job.wait(400) == 0, log.read_text()
+        assert job.wait(PATIENCE_S) == 0, log.read_text()
     finally:
         if job.poll() is None:
             kill(job)

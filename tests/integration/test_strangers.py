@@ -18,7 +18,7 @@ import pytest
 from tests.integration.machines import at, connect, machines, on, root
 from tests.integration.ray_head import ROOT, copy_of_the_code, end, ray_start, short_folder, with_token
 
-pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.ray, pytest.mark.slow]
 
 FIREWALL = ROOT / "deploy" / "firewall.nft"
 HEAD, MEMBER, GATE, STRANGER = "10.77.1.1", "10.77.1.2", "10.77.2.1", "10.77.2.2"

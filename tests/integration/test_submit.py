@@ -19,7 +19,6 @@ from tests.integration.ray_head import NO_TOKEN, Head, copy_of_the_code, finish,
 pytestmark = [
     pytest.mark.ray,
     pytest.mark.slow,
-    pytest.mark.timeout(900),
     pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:DeprecationWarning"),  # MLflow's own query
 ]
 LONG = dataclasses.replace(
@@ -101,7 +100,6 @@ def test_ray_job_submit_runs_a_sweep(head, checkout, tmp_path):
         env={**clean_environment(), **NO_TOKEN},
         capture_output=True,
         text=True,
-        timeout=800,
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr

@@ -16,7 +16,6 @@ from tests.integration.ray_head import copy_of_the_code, finish, joined_node, ki
 pytestmark = [
     pytest.mark.ray,
     pytest.mark.slow,
-    pytest.mark.timeout(900),
     pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:DeprecationWarning"),  # MLflow's own query
 ]
 

@@ -16,7 +16,6 @@ from tests.integration.jobs import Job
 pytestmark = [
     pytest.mark.ray,
     pytest.mark.slow,
-    pytest.mark.timeout(900),  # Ray starts over and over, which takes a busy machine a minute each time
     pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:DeprecationWarning"),  # MLflow's own query
 ]
 

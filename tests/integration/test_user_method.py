@@ -19,7 +19,6 @@ from tests.integration.conftest import SMALL, flags
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.timeout(600),
     pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:DeprecationWarning"),  # MLflow's own query
 ]
 EXAMPLES = Path(__file__).parents[2] / "deploy" / "examples"

@@ -39,7 +39,7 @@ def start_a_world(folder):
     """Runs the sources in `folder` in a new process: (sum of the start positions, whether CACHE_DIR is unchanged)."""
     env = os.environ | {"PYTHONPATH": str(folder), "NUMBA_CACHE_DIR": str(folder / "cache")}
     done = subprocess.run(
-        [sys.executable, "-c", START_A_WORLD], cwd=folder, env=env, capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", START_A_WORLD], cwd=folder, env=env, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     total, unchanged = done.stdout.split()
