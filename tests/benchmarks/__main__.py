@@ -12,7 +12,17 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 from learner.ray_backend.auth import guard_ray  # noqa: E402
 from tests.benchmarks import simulator  # noqa: E402
 
-BENCHMARKS = ("simulator", "replay", "learner", "service", "scaling", "profile", "export", "checkpoints")
+BENCHMARKS = (
+    "simulator",
+    "replay",
+    "learner",
+    "service",
+    "scaling",
+    "profile",
+    "export",
+    "checkpoints",
+    "user_methods",
+)
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
