@@ -45,9 +45,9 @@ types: $(READY)
 kernels: $(READY)
 	$(BIN)/python -m tests.precompile
 
-# Style, types, import rules, then all tests. ARGS goes to pytest, which runs WORKERS processes: more than two cores,
-# since tests with a Ray wait for half of their time.
-WORKERS ?= 4
+# Style, types, import rules, then all tests. ARGS goes to pytest, which runs WORKERS processes. Four on two cores are too
+# many: each starts a Ray of its own, and a machine that is that busy misses deadlines.
+WORKERS ?= 2
 test: style
 	$(MAKE) --no-print-directory --jobs 2 types kernels
 	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder $(ARGS)
