@@ -1,7 +1,9 @@
 """Small runs for integration tests."""
 
+import contextlib
 import dataclasses
 import functools
+import io
 import os
 import subprocess
 import sys
@@ -9,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from deploy.cli import main
 from learner.config import RunConfig
 from sim_core.config import WorldConfig
 
@@ -61,6 +64,14 @@ def run_shoal(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]
         text=True,
         check=False,
     )
+
+
+def run_here(*arguments: str) -> str:
+    """What the command `shoal` prints, run to its end in this process, which has its libraries loaded already."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        assert main(arguments) == 0
+    return out.getvalue()
 
 
 def clean_environment() -> dict[str, str]:

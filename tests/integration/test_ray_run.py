@@ -15,7 +15,7 @@ from safetensors.numpy import load_file
 from learner.checkpoints.checkpoint import Checkpoint, newest_valid
 from learner.config import RunConfig, flat_params, to_dict
 from learner.ray_backend.cluster import COLLECTS_IN_FLIGHT, PUSHES_IN_FLIGHT
-from tests.integration.conftest import PATIENCE_S, SMALL, flags, run_shoal
+from tests.integration.conftest import PATIENCE_S, SMALL, flags, run_here
 from tests.integration.jobs import Job
 
 pytestmark = [
@@ -24,6 +24,11 @@ pytestmark = [
 ]
 
 LONG = dataclasses.replace(SMALL, engine="ray", total_env_steps=400_000, checkpoint_every_env_steps=4_000)
+
+
+def location(folder: Path) -> list[str]:
+    """The flags of a run `r` in a folder; MLflow keeps a tracking URI for all of this process."""
+    return ["--runs-dir", f"{folder}/runs", "--name", "r", "--tracking-uri", f"sqlite:///{folder}/runs/mlflow.db"]
 
 
 def the_run(folder: Path):
@@ -50,18 +55,16 @@ SPREAD = dataclasses.replace(SMALL, engine="ray", workers=2, replay_shards=2, re
 
 @pytest.fixture(scope="class")
 def finished(tmp_path_factory: pytest.TempPathFactory):
-    """(folder, outcome of the command) of a run with two workers and two shards of their own."""
+    """(folder, output of the command) of a run with two workers and two shards of their own."""
     folder = tmp_path_factory.mktemp("finished")
-    done = run_shoal(folder, "train", "--name", "r", *flags(SPREAD))
-    assert done.returncode == 0, done.stderr
-    return folder, done
+    return folder, run_here("train", *location(folder), *flags(SPREAD))
 
 
 class TestAFinishedRun:
     def test_a_run_over_ray_leaves_everything_a_user_compares(self, finished):
-        folder, done = finished
+        folder, output = finished
         for word in ("success rate", "MLflow UI", "checkpoint", "curve", "animation"):
-            assert word in done.stdout
+            assert word in output
         client, run = the_run(folder)
         assert run.info.status == "FINISHED"
         assert run.info.run_name == "sensor 3r×2g s0"
@@ -91,10 +94,9 @@ class TestAFinishedRun:
         assert_transitions_are_accounted_for(newest_valid(folder / "runs/r/checkpoints")[0], SPREAD)
 
 
-def test_every_transition_of_prioritised_replay_is_accounted_for(shoal, tmp_path):
+def test_every_transition_of_prioritised_replay_is_accounted_for(tmp_path):
     config = dataclasses.replace(SPREAD, replay="prioritised", network="dueling")
-    done = shoal("train", "--name", "r", *flags(config))
-    assert done.returncode == 0, done.stderr
+    run_here("train", *location(tmp_path), *flags(config))
     checkpoint, _ = newest_valid(tmp_path / "runs/r/checkpoints")
     assert_transitions_are_accounted_for(checkpoint, config)
     assert_priorities_came_back(checkpoint.folder, checkpoint.state["learner"]["shards"])
@@ -126,7 +128,7 @@ def assert_priorities_came_back(folder: Path, shards: list) -> None:
         assert len(np.unique(priorities)) > 100
 
 
-def test_kill_9_of_the_whole_job_costs_only_what_came_after_the_last_checkpoint(shoal, tmp_path):
+def test_kill_9_of_the_whole_job_costs_only_what_came_after_the_last_checkpoint(tmp_path):
     job = Job(tmp_path, "train", "--name", "r", *flags(LONG))
     try:
         job.wait_for_checkpoints("r", 3)
@@ -137,9 +139,7 @@ def test_kill_9_of_the_whole_job_costs_only_what_came_after_the_last_checkpoint(
     assert run.info.status == "RUNNING", "nobody could say that it ended"
     before, _ = newest_valid(tmp_path / "runs/r/checkpoints")
     end = before.state["env_steps"] + 8_000
-    done = shoal("resume", "r", "--total-env-steps", str(end))
-    assert done.returncode == 0, done.stderr
-    assert str(before.folder) in done.stdout
+    assert str(before.folder) in run_here("resume", str(tmp_path / "runs/r"), "--total-env-steps", str(end))
     after, _ = newest_valid(tmp_path / "runs/r/checkpoints")
     assert end <= after.state["env_steps"] < end + 8_000
     assert after.state["updates"] > before.state["updates"]
@@ -147,7 +147,7 @@ def test_kill_9_of_the_whole_job_costs_only_what_came_after_the_last_checkpoint(
     assert_history_is_the_journal(tmp_path, "r")
 
 
-def test_ctrl_c_saves_and_says_how_to_go_on(shoal, tmp_path):
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path):
     job = Job(tmp_path, "train", "--name", "r", *flags(LONG))
     try:
         job.wait_for_checkpoints("r", 1)
@@ -165,7 +165,6 @@ def test_ctrl_c_saves_and_says_how_to_go_on(shoal, tmp_path):
     assert not skipped
     said = int(output.split("stopped by SIGINT at ")[1].split()[0].replace(",", ""))
     assert saved.state["env_steps"] == said, "the checkpoint is of the moment of the stop"
-    done = shoal("resume", "r", "--total-env-steps", str(saved.state["env_steps"] + 4_000))
-    assert done.returncode == 0, done.stderr
+    run_here("resume", str(tmp_path / "runs/r"), "--total-env-steps", str(said + 4_000))
     assert the_run(tmp_path)[1].info.status == "FINISHED"
     assert_history_is_the_journal(tmp_path, "r")

@@ -11,6 +11,7 @@ from learner.sweep.cell import SweepLocation, run_cell
 from learner.sweep.grid import SweepConfig, make_cells
 from learner.sweep.tune import run_cells
 from learner.tracking.mlflow_run import Tracker
+from tests.integration.conftest import run_here
 from tests.integration.jobs import Job
 
 pytestmark = [
@@ -67,8 +68,8 @@ def test_a_sweep_that_is_killed_twice_has_every_cell_once(shoal, rows, tmp_path)
     assert {run.info.status for run in runs} == {"FINISHED"}
     assert sum(name.startswith("mlflow.sharedViewState.") for name in experiment.tags) >= 4
 
-    again = shoal(*COMMAND)
-    assert again.returncode == 0 and "8 of 8 cells" in again.stdout
+    location = ["--runs-dir", f"{tmp_path}/runs", "--tracking-uri", f"sqlite:///{tmp_path}/runs/mlflow.db"]
+    assert "8 of 8 cells" in run_here(*COMMAND, *location)
     assert len(client.search_runs([experiment.experiment_id])) == 8
 
 
