@@ -8,7 +8,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from docker.utils.build import exclude_paths
+from docker.utils.build import PatternMatcher
 from packaging.requirements import Requirement
 
 from tests.deploy.project import CONTAINERFILE, ROOT, image_ray_version, instructions, project
@@ -59,14 +59,15 @@ def test_the_ray_version_satisfies_the_projects_requirement():
 def context() -> set[str]:
     """Files in the build context: those that neither git nor the container's ignore file ignores."""
     patterns = [line for line in IGNORED.read_text().splitlines() if line and not line.startswith("#")]
-    seen = exclude_paths(str(ROOT), patterns)
+    ignored = PatternMatcher(patterns)
     listed = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
         capture_output=True,
         check=True,
     )
-    return seen & set(listed.stdout.decode().split("\0"))
+    names = filter(None, listed.stdout.decode().split("\0"))
+    return {name for name in names if not ignored.matches(name)}
 
 
 @pytest.fixture(scope="module")
