@@ -96,8 +96,9 @@ def test_the_build_context_holds_only_what_is_copied(copied):
 
 @pytest.mark.slow
 def test_the_copied_files_build_a_wheel_with_every_package(copied, tmp_path):
+    source = shutil.copytree(copied, tmp_path / "source")  # a build writes into it
     command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet", "-w", tmp_path]
-    done = subprocess.run([*command, copied], capture_output=True, text=True, check=False)
+    done = subprocess.run([*command, source], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     (wheel,) = tmp_path.glob("shoal-*.whl")
     with zipfile.ZipFile(wheel) as archive:

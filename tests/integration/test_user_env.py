@@ -22,8 +22,9 @@ def test_it_trains_resumes_and_is_registered_in_mlflow(tmp_path, capsys):
     assert path.name.startswith("tests.own_env-Line-v0-s0-")
     assert main(["resume", str(path), "--total-env-steps", "7000"]) == 0
     assert main(["evaluate", str(path), "--episodes", "4"]) == 0
-    client = mlflow.MlflowClient(RunFolder(path).identity().tracking_uri)
-    assert [model.name for model in client.search_registered_models()] == ["tests.own_env-Line-v0"]
+    uri = RunFolder(path).identity().tracking_uri
+    models = mlflow.MlflowClient(uri, registry_uri=uri).search_registered_models()
+    assert [model.name for model in models] == ["tests.own_env-Line-v0"]
 
 
 def test_a_module_that_is_not_there_is_refused(tmp_path, capsys):
