@@ -71,7 +71,7 @@ def mlflow_client(uri: str) -> mlflow.MlflowClient:
     """A client of the store at `uri`; silences MLflow's own log messages."""
     logging.getLogger("mlflow").setLevel(logging.ERROR)
     logging.getLogger("alembic").setLevel(logging.ERROR)
-    return mlflow.MlflowClient(uri, registry_uri=os.environ.get("MLFLOW_REGISTRY_URI") or uri)
+    return mlflow.MlflowClient(uri)
 
 
 class Tracker:

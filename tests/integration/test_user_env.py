@@ -15,7 +15,8 @@ pytestmark = [
 ]
 
 
-def test_it_trains_resumes_and_is_registered_in_mlflow(tmp_path, capsys):
+def test_it_trains_resumes_and_is_registered_in_mlflow(tmp_path, monkeypatch):
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)  # MLflow sets it when a run of this process logs a model
     config = dataclasses.replace(SMALL, env_id="tests.own_env:Line-v0")
     assert main(["train", "--runs-dir", str(tmp_path), *flags(config)]) == 0
     (path,) = (path.parent for path in tmp_path.glob("*/config.json"))
@@ -23,7 +24,7 @@ def test_it_trains_resumes_and_is_registered_in_mlflow(tmp_path, capsys):
     assert main(["resume", str(path), "--total-env-steps", "7000"]) == 0
     assert main(["evaluate", str(path), "--episodes", "4"]) == 0
     uri = RunFolder(path).identity().tracking_uri
-    models = mlflow.MlflowClient(uri, registry_uri=uri).search_registered_models()
+    models = mlflow.MlflowClient(uri).search_registered_models()
     assert [model.name for model in models] == ["tests.own_env-Line-v0"]
 
 
