@@ -75,7 +75,8 @@ class RunFolder:
         for name, text in user_files(config).items():
             path = self.path / file_names.USER_FILES / name
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text, "utf-8")
+            with replacing_file(path) as partial:
+                partial.write_text(text, "utf-8")
 
     def config(self) -> RunConfig:
         """Reads `config.json`.
