@@ -27,7 +27,7 @@ from typing import Any, Literal
 
 from learner.config import RunConfig
 from sim_core.config import WorldConfig
-from sim_core.plugins import METHODS, load, read_source
+from sim_core.plugins import METHODS, find
 
 PresetName = Literal["thesis", "best"]
 
@@ -56,6 +56,6 @@ def preset_config(name: PresetName, method: str, robots: int = 10, groups: int =
     Raises:
       ConfigError: the method is unknown or the setup is not possible.
     """
-    presets = load(METHODS, method, read_source(METHODS, method)).presets or load(METHODS, "sensor", "").presets
+    presets = find(METHODS, method).presets or find(METHODS, "sensor").presets
     training, world = presets[name]
     return RunConfig(world=WorldConfig(method=method, robots=robots, groups=groups, **world), **_COMMON, **training)

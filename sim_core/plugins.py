@@ -145,6 +145,11 @@ def load(kind: Kind, name: str, source: str) -> type[Any]:
     return found
 
 
+def find(kind: Kind, name: str) -> type[Any]:
+    """The class that `name` names now; a user's own file is read (see `read_source` and `load` for errors)."""
+    return load(kind, name, read_source(kind, name))
+
+
 def _attribute(place: str) -> type[Any]:
     module, _, cls = place.partition(":")
     found: type[Any] = getattr(importlib.import_module(module), cls)

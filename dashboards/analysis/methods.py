@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from sim_core.plugins import DISSERTATION_METHODS, METHODS, load
+from sim_core.plugins import DISSERTATION_METHODS, METHODS, find
 
 
 class MethodStyle(NamedTuple):
@@ -37,7 +37,7 @@ STYLES = (
 
 def method_label(name: str) -> str:
     """Label of a method, by its name in a table of results; a user's own method is called by its class."""
-    return str(load(METHODS, name, "").label) if name in METHODS.built_in else name
+    return str(find(METHODS, name).label) if name in METHODS.built_in else name
 
 
 def method_style(name: str) -> MethodStyle:

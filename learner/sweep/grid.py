@@ -16,7 +16,7 @@ from learner.config import WHERE, RunConfig, identity_dict, to_dict
 from learner.presets import PresetName, preset_config
 from sim_core.checks import ConfigError, check_fields, require
 from sim_core.config import WorldConfig
-from sim_core.plugins import DISSERTATION_METHODS, METHODS, load, read_source, short_name
+from sim_core.plugins import DISSERTATION_METHODS, METHODS, find, short_name
 
 BaselineName = Literal["fl-orca", "greedy", "random"]
 
@@ -69,7 +69,7 @@ class SweepConfig:
             f"baselines must be among {', '.join(rules)}, not {self.baselines}",
         )
         for method in self.methods:
-            load(METHODS, method, read_source(METHODS, method))
+            find(METHODS, method)
         names = [short_name(METHODS, method) for method in self.methods]
         require(len(set(names)) == len(names), f"methods must have different names, not {', '.join(names)}")
         for name in ("episodes", "extrapolation_episodes", "baseline_episodes", "env_steps"):
