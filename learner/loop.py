@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, Protocol, TypeVar, TypeVarTuple
 
 from actors.evaluation.evaluator import evaluate
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.rollout.exploration import epsilon
 from actors.rollout.node import RolloutNode
 from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, FaultTracker

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from actors.evaluation.evaluator import evaluate_in_parallel
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.service.fault_policy import CallFailed, ComponentFailed, FaultTracker, RunFailed, first_line
 from actors.service.messages import EpisodeStats
 from actors.storage.uri import Location

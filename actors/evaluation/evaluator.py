@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from actors.evaluation.trajectory import NO_ACTION, Episode
 from actors.policy.baselines import ActionRule, Baseline, make_baseline
-from actors.policy.network import Policy, WeightsSnapshot
+from actors.policy.policy import Policy, WeightsSnapshot
 from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
 from actors.rollout.worker import join_stats
 from actors.service.fault_policy import Action, CallFailed, ComponentKind, decide

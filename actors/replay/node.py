@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.replay.prioritised import PrioritisedShard, PrioritySettings
 from actors.replay.shard import ReplayShard
 from actors.service.messages import AddReply, Delivered, SampleReply, TransitionBlock

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.rollout.worker import RolloutSettings, RolloutWorker
 from actors.service.fault_policy import Action, CallFailed, ComponentKind, Fault, decide
 from actors.service.messages import (

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.policy.network import Policy, WeightsSnapshot
+from actors.policy.policy import Policy, WeightsSnapshot
 from actors.rollout.exploration import draw_random_actions, explore
 from actors.rollout.nstep import NStepAssembler, Steps, empty_steps
 from actors.rollout.vector_env import EnvSpec, final_observations, make_vector_env, reset_seeded, spaces_of

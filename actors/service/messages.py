@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.policy.policy import WeightsSnapshot
 from actors.service.fault_policy import Fault
 from actors.service.packing import Packed
-
-if TYPE_CHECKING:
-    from actors.policy.network import WeightsSnapshot  # imports torch, which messages do without
 
 SCHEMA_VERSION = 3
 """Version of the block layout; a shard refuses any other."""

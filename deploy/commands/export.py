@@ -9,7 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from torch import nn
 
-from actors.policy.network import QNetwork, WeightsSnapshot, load_snapshot
+from actors.policy.network import QNetwork, load_snapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import env_shape
 from deploy.options.results import Export
 from deploy.runs.folders import make_folder

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from actors.evaluation.evaluator import record_episode
 from actors.evaluation.trajectory import save_episodes
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from dashboards.figures.film_strip import episode_strip_png
 from dashboards.figures.video import check_video_packages
 from deploy.console.serving import serve_until_interrupted

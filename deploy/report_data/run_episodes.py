@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from actors.evaluation.evaluator import evaluate, record_episode
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from dashboards.pages.player import player_data
 from dashboards.pages.report_page import EpisodeGroup
 from deploy.report_data.episode_sources import nth

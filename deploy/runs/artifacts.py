@@ -7,7 +7,7 @@ from pathlib import Path
 
 from actors.evaluation.evaluator import record_episode, record_frames
 from actors.evaluation.trajectory import Episode, load_episodes, save_episodes
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import env_shape
 from dashboards.figures.learning_curve import learning_curve_png
 from dashboards.figures.video import check_video_packages, episode_frames, write_mp4

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import env_shape
 from learner.checkpoints.checkpoint import Checkpoint, best_valid, finished_names, newest_valid, valid_named
 from learner.checkpoints.retention import scores_of

@@ -8,7 +8,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from actors.policy.network import NETWORKS, DuelingNetwork, QNetwork, WeightsSnapshot, load_snapshot, snapshot
+from actors.policy.network import NETWORKS, DuelingNetwork, QNetwork, load_snapshot, snapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import EnvShape
 from actors.storage.atomic_write import replacing_file
 from actors.storage.uri import fetched, join_location

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.evaluation.evaluator import Candidate, make_action_rule
-from actors.policy.network import Policy, WeightsSnapshot
+from actors.policy.policy import Policy, WeightsSnapshot
 from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
 from learner.export.robot_module import robot_class
 from sim_core import ENV_ID

@@ -1,4 +1,4 @@
-"""Places the nodes of a run as Ray actors and calls them; translates Ray's errors into faults.
+"""Places the nodes of a run as Ray actors.
 
 Rollout workers push to the shards themselves; the driver holds references and small reports only. The shards are
 embedded in the learner's actor, or with `replay_placement = "actors"` each is an actor of its own.
@@ -9,35 +9,22 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from contextlib import suppress
-from functools import lru_cache
 from typing import Any, TypeVar, TypeVarTuple
 
 import psutil
 import ray
-from ray.exceptions import (
-    ActorUnavailableError,
-    AuthenticationError,
-    GetTimeoutError,
-    NodeDiedError,
-    ObjectLostError,
-    OutOfMemoryError,
-    RayActorError,
-    RayError,
-    RayTaskError,
-    TaskCancelledError,
-    WorkerCrashedError,
-)
+from ray.exceptions import AuthenticationError
 
 from actors.evaluation.evaluator import Candidate, evaluate_in_parallel
 from actors.replay.node import ShardNode
 from actors.rollout.node import RolloutNode
 from actors.rollout.vector_env import EnvSpec, env_shape
-from actors.service.fault_policy import CallFailed, ComponentFailed, Fault, first_line
 from actors.service.messages import EpisodeStats
 from actors.service.rpc import Handle, LocalCalls, Ref, local_handle
 from learner.cluster_options import DEADLINE_S, ClusterOptions
 from learner.config import RunConfig
 from learner.ray_backend.auth import TOKEN_HELP, guard_ray
+from learner.ray_backend.calls import RayCalls
 from learner.training.cluster import (
     Cluster,
     Limits,
@@ -48,7 +35,6 @@ from learner.update.learner_node import LearnerNode
 from sim_core.checks import ConfigError, require
 
 N = TypeVar("N")
-T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 
 PUSHES_IN_FLIGHT = 2
@@ -61,13 +47,6 @@ INNER_SHARE = 0.3
 """Share of the deadline that nodes give each other, so that a node that waits twice in a row is not itself late."""
 RAYLET = "raylet"
 """Name of the process from which a local Ray starts its workers."""
-FAULTS: tuple[tuple[tuple[type[Exception], ...], Fault], ...] = (
-    ((ActorUnavailableError,), Fault.UNREACHABLE),
-    ((RayActorError, WorkerCrashedError, NodeDiedError, OutOfMemoryError, TaskCancelledError), Fault.DIED),
-    ((ObjectLostError,), Fault.OBJECT_LOST),
-    ((GetTimeoutError,), Fault.LATE),
-)
-"""The fault that each error of Ray stands for; the first match counts."""
 LOCAL_RAY = {
     "idle_worker_killing_time_threshold_ms": 24 * 3_600_000,
     "task_events_report_interval_ms": 0,
@@ -80,73 +59,6 @@ process after a second and start the next one from nothing. The last 100,000 cal
 and only Ray's dashboard shows them. Blocks of up to 1 MiB travel in the call itself: above Ray's default of 100 KiB
 they would go through the object store, which costs several more calls."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-
-
-@lru_cache
-def _task(function: Callable[..., Any]) -> Any:
-    return ray.remote(num_cpus=0, max_retries=0)(function)
-
-
-def _as_fault(error: Exception) -> Exception:
-    """The fault that an error of Ray stands for; an error that our own code raised, unchanged."""
-    if isinstance(error, RayTaskError):
-        cause = getattr(error, "cause", None)
-        if isinstance(cause, CallFailed | ComponentFailed | ConfigError):  # ConfigError: of a user's own method
-            return cause
-        return _as_fault(cause) if isinstance(cause, RayError) else error
-    for kinds, fault in FAULTS:
-        if isinstance(error, kinds):
-            return CallFailed(fault, first_line(error))
-    return error
-
-
-class RayCalls:
-    """Calls of Ray actors; implements `actors.service.rpc.Calls`.
-
-    Args:
-      deadline_s: most time that `get` waits.
-    """
-
-    def __init__(self, deadline_s: float) -> None:
-        self._deadline_s = deadline_s
-
-    def start(self, node: Handle[N], method: Callable[[N, *Ts], T], *args: *Ts) -> Ref[T]:
-        """Starts an actor's method."""
-        ref: Ref[T] = getattr(node, method.__name__).remote(*args)
-        return ref
-
-    def run(self, function: Callable[[*Ts], T], *args: *Ts) -> Ref[T]:
-        """Starts a function as a Ray task, which takes no CPU slot: the run's actors may hold them all."""
-        ref: Ref[T] = _task(function).remote(*args)
-        return ref
-
-    def wait(self, refs: list[Ref[T]], timeout_s: float) -> list[Ref[T]]:
-        """Blocks until one of `refs` is there or the time is over; returns those that are there, in the given order."""
-        ray.wait(refs, num_returns=1, timeout=timeout_s, fetch_local=False)
-        ready = set(ray.wait(refs, num_returns=len(refs), timeout=0, fetch_local=False)[0])
-        return [ref for ref in refs if ref in ready]
-
-    def get(self, ref: Ref[T]) -> T:
-        """The result behind `ref`.
-
-        Raises:
-          CallFailed: the call could not be made, its result is gone, or the deadline passed.
-        """
-        try:
-            result: T = ray.get(ref, timeout=self._deadline_s)
-            return result
-        except GetTimeoutError as error:
-            raise CallFailed(Fault.LATE, f"no answer within {self._deadline_s:.0f} s") from error
-        except RayError as error:
-            fault = _as_fault(error)
-            if fault is error:
-                raise
-            raise fault from error
-
-    def put(self, value: T) -> Ref[T]:
-        """Puts a value into the object store."""
-        ref: Ref[T] = ray.put(value)
-        return ref
 
 
 class LearnerActor(LearnerNode):

@@ -18,7 +18,7 @@ from actors.evaluation.evaluation_store import StoredEvaluation, save_evaluation
 from actors.evaluation.evaluator import evaluate
 from actors.evaluation.result_table import LEARNED, ResultRow, read_table, write_table
 from actors.policy.baselines import Baseline
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import env_shape
 from actors.service.messages import EpisodeStats
 from learner.checkpoints.checkpoint import Checkpoint

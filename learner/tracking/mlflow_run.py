@@ -19,7 +19,8 @@ from urllib.parse import urlsplit
 import numpy as np
 import torch
 
-from actors.policy.network import QNetwork, WeightsSnapshot, load_snapshot
+from actors.policy.network import QNetwork, load_snapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import EnvShape
 from actors.service.fault_policy import first_line
 from learner.config import RunConfig, config_hash, flat_params, user_files

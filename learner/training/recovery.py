@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol, TypeVar, TypeVarTuple
 
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.replay.node import ShardNode
 from actors.rollout.node import PushTarget, RolloutNode
 from actors.service.fault_policy import (

@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from actors.policy.network import NETWORKS, WeightsSnapshot, snapshot
+from actors.policy.network import NETWORKS, snapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import EnvShape
 from learner.config import RunConfig
 from learner.update.compiled_updates import CompiledUpdates

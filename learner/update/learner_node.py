@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.replay.node import ShardNode
 from actors.rollout.vector_env import EnvShape
 from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind

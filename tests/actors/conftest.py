@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import EnvSpec, env_shape
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig

@@ -17,7 +17,8 @@ import numpy as np
 
 import sim_core  # noqa: F401  registers our environment, in whatever process this is
 from actors.evaluation.evaluator import evaluate
-from actors.policy.network import WeightsSnapshot, snapshot
+from actors.policy.network import snapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import EnvSpec
 from learner.config import RunConfig, from_dict, to_dict
 from learner.training.evaluation_summary import score, summarise

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import ray
 
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.replay.node import make_shard
 from actors.rollout.vector_env import env_shape
 from actors.rollout.worker import RolloutWorker

@@ -7,7 +7,8 @@ import pytest
 import torch
 from stable_baselines3.common.env_util import make_vec_env
 
-from actors.policy.network import Policy, QNetwork
+from actors.policy.network import QNetwork
+from actors.policy.policy import Policy
 from actors.rollout.vector_env import env_shape, make_vector_env
 from learner.config import RunConfig
 from tests.benchmarks import contest, entrants, peers

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from requests import ConnectionError as NoConnection
 
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from actors.service.fault_policy import Component, ComponentFailed, ComponentKind, Fault
 from actors.service.messages import EpisodeStats
 from learner.cluster_options import ClusterOptions

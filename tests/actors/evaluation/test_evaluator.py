@@ -9,7 +9,7 @@ import pytest
 from actors.evaluation import evaluator
 from actors.evaluation.evaluator import evaluate, evaluate_in_parallel, record_episode, record_frames
 from actors.policy.baselines import Baseline
-from actors.policy.network import Policy
+from actors.policy.policy import Policy
 from actors.rollout.vector_env import EnvSpec
 from actors.service.messages import NO_OUTCOME
 from actors.service.rpc import LocalCalls

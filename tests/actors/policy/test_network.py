@@ -6,7 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.policy.network import NETWORKS, DuelingNetwork, Policy, QNetwork, WeightsSnapshot, load_snapshot, snapshot
+from actors.policy.network import NETWORKS, DuelingNetwork, QNetwork, load_snapshot, snapshot
+from actors.policy.policy import Policy, WeightsSnapshot
 
 
 def make_network(size, hidden_sizes, num_actions, seed=0, kind="plain"):

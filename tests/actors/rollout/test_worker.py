@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from actors.policy.network import Policy
+from actors.policy.policy import Policy
 from actors.rollout.vector_env import env_shape
 from actors.rollout.worker import RolloutSettings, RolloutWorker, join_stats
 from actors.service.messages import NO_OUTCOME, SCHEMA_VERSION, EpisodeStats, transition_dtype

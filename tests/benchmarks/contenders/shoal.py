@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from actors.policy.network import WeightsSnapshot
+from actors.policy.policy import WeightsSnapshot
 from tests.benchmarks.contest import Finding, Heat, Lap, compete
 from tests.benchmarks.ray_service import ray_service
 from tests.checkpointing import Silent

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from actors.policy.network import Policy
+from actors.policy.policy import Policy
 from actors.rollout.vector_env import env_shape
 from learner.config import RunConfig, config_hash, flat_params
 from learner.tracking.journal import Row

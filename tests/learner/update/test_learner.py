@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from actors.policy.network import Policy
+from actors.policy.policy import Policy
 from actors.rollout.vector_env import EnvShape
 from actors.service.messages import transition_dtype
 from learner.config import RunConfig

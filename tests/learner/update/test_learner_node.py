@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from actors.policy.network import Policy, WeightsSnapshot
+from actors.policy.policy import Policy, WeightsSnapshot
 from actors.replay.node import ShardNode, ShardSettings
 from actors.replay.prioritised import PRIORITY_EPSILON, PrioritySettings
 from actors.rollout.worker import join_stats

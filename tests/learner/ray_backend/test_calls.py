@@ -4,8 +4,8 @@ import pytest
 from ray import exceptions as ray_errors
 
 from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, Fault
-from learner.ray_backend import cluster as ray_cluster
-from learner.ray_backend.cluster import RayCalls
+from learner.ray_backend import calls as ray_calls
+from learner.ray_backend.calls import RayCalls
 
 DIED = ray_errors.ActorDiedError()
 OWNER = ray_errors.OwnerDiedError("0" * 56, None, "")
@@ -31,7 +31,7 @@ def get(monkeypatch):
         def failing_get(ref, timeout):
             raise error
 
-        monkeypatch.setattr(ray_cluster.ray, "get", failing_get)
+        monkeypatch.setattr(ray_calls.ray, "get", failing_get)
         with pytest.raises(Exception) as caught:  # noqa: PT011 - the test looks at it
             RayCalls(5.0).get("ref")
         return caught.value
