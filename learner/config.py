@@ -107,6 +107,8 @@ class RunConfig:
     """Hard: updates between two copies (C)."""
     target_update_rate: float = 0.005
     """Soft: share of the online network blended in per update (tau)."""
+    policy_average_updates: int = 0
+    """Time constant, in updates, of the moving average of the weights, which acts, is evaluated and saved; 0: none."""
     loss: Literal["huber", "mse"] = "huber"
     """Huber loss of the TD error (quadratic up to 1, linear beyond), or mean squared error."""
     max_gradient_norm: float = 10.0
@@ -208,6 +210,10 @@ def _check_ranges(config: RunConfig) -> None:
         require(getattr(config, name) > 0, f"{name} must be greater than 0, not {getattr(config, name)}")
     rate = config.target_update_rate
     require(0 < rate <= 1, f"target_update_rate must be in (0, 1], not {rate}")
+    require(
+        config.policy_average_updates >= 0,
+        f"policy_average_updates must not be negative, not {config.policy_average_updates}",
+    )
     require(config.ladder_exponent >= 0, f"ladder_exponent must not be negative, not {config.ladder_exponent}")
     sizes = config.hidden_sizes
     require(

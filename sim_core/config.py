@@ -58,7 +58,9 @@ class WorldConfig:
     learner_speed_m_s: float = 1.0
     """v, the constant speed of the learning robot (Table 3.2)."""
     horizon_steps: int = 500
-    """eta, env steps after which an episode is cut (Table 3.2)."""
+    """eta, simulator steps after which an episode is cut (Table 3.2)."""
+    decision_interval_steps: int = 1
+    """Simulator steps of one decision, for which the learning robot keeps its action (1 in the text)."""
     reward_scale: float = 1.0
     """tau, the size of the terminal reward (Table 3.2)."""
     reward_clock: Literal["step", "horizon"] = "step"
@@ -67,7 +69,7 @@ class WorldConfig:
     """`sensor`: own-group less other-group robots a cell (3.2.1), or both counts apart (ours)."""
 
     outside_limit_steps: int = 100
-    """`in`, `out`: phi, env steps outside the own ellipse, one after the other, that fail (not given in the text)."""
+    """`in`, `out`: phi, simulator steps outside the own ellipse in a row that fail (not given in the text)."""
     ellipse_covariance: Literal["diagonal", "full"] = "diagonal"
     """`in`, `out`: covariance of a group's positions, with sigma_xy = 0 (4.2.1) or with all of it."""
     ellipse_axes: Literal["confidence", "printed"] = "confidence"
@@ -98,7 +100,7 @@ class WorldConfig:
     """`in`, `out`: a step's +tau/100 is for being inside (Table 4.1), or inside and closer to the goal (ours)."""
 
     time_step_s: float = 0.05
-    """dt, simulated time per env step."""
+    """dt, simulated time of one simulator step."""
     arena_radius_m: float = 6.0
     """Radius of the circle on which group centres start; goals are antipodal."""
     start_spacing_m: float = 0.45
@@ -195,6 +197,11 @@ class WorldConfig:
         return self.sectors + int(self.stop_action)
 
     @property
+    def decision_s(self) -> float:
+        """Simulated time of one decision, seconds."""
+        return self.decision_interval_steps * self.time_step_s
+
+    @property
     def learner_is_known(self) -> bool:
         """Whether the swarm knows the learning robot, as `swarm_knows_learner` or the method has it."""
         by_method = self.swarm_knows_learner == "method"
@@ -261,6 +268,11 @@ def _check_counts(config: WorldConfig) -> None:
     require(config.groups >= 1, f"groups must be at least 1, not {config.groups}")
     require(2 <= config.sectors <= MAX_HEADINGS, f"sectors must be between 2 and {MAX_HEADINGS}, not {config.sectors}")
     require(config.horizon_steps >= 1, f"horizon_steps must be at least 1, not {config.horizon_steps}")
+    require(
+        1 <= config.decision_interval_steps <= config.horizon_steps,
+        f"decision_interval_steps must be between 1 and horizon_steps ({config.horizon_steps}), not "
+        f"{config.decision_interval_steps}",
+    )
     require(
         config.outside_limit_steps >= 1, f"outside_limit_steps must be at least 1, not {config.outside_limit_steps}"
     )

@@ -59,7 +59,7 @@ def _check_render_mode(render_mode: str | None) -> None:
 
 
 def _frames_per_s(config: WorldConfig) -> int:
-    return max(1, round(1 / config.time_step_s))
+    return max(1, round(1 / config.decision_s))
 
 
 def _draw(worlds: WorldBatch, world: int) -> NDArray[np.uint8]:

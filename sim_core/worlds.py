@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import enum
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,12 +20,24 @@ from sim_core.state import CONSTANT, WorldState, empty_state
 from sim_core.swarm.step import advance, reset_episode, swarm_params
 from sim_core.swarm.tile import world_tile
 
+_RUNNING = np.int8(Outcome.RUNNING)
+
+
+class Pilot(enum.Enum):
+    """FL-ORCA in the learning robot's place, for which it knows its goal and its neighbours' velocities."""
+
+    FREE = enum.auto()
+    """It moves with FL-ORCA's velocity."""
+    SNAPPED = enum.auto()
+    """It takes the action whose velocity is nearest to FL-ORCA's."""
+
 
 class StepResult(NamedTuple):
-    """What a step gives back, one entry a world.
+    """What a decision leads to, one entry a world.
 
-    `observation` is the state reached by the step, also where the episode ended. Shapes `[num_worlds, ...]`;
-    reward float32, outcome int8 (see Outcome), steps int32, episode_return float64.
+    `observation` is the state after it, also where the episode ended; `reward` the sum over its simulator steps;
+    `steps` the simulator steps of the episode so far. Shapes `[num_worlds, ...]`; reward float32, outcome int8 (see
+    Outcome), steps int32, episode_return float64.
     """
 
     observation: NDArray[Any]
@@ -39,6 +53,9 @@ class WorldBatch:
     Args:
       config: the setup.
       num_worlds: size of the batch.
+
+    Attributes:
+      step_reward: `[num_worlds]` float32, reward of the last simulator step.
     """
 
     def __init__(self, config: WorldConfig, num_worlds: int) -> None:
@@ -53,6 +70,8 @@ class WorldBatch:
         self._command_y = np.zeros(num_worlds, np.float32)
         self._observation = np.zeros((num_worlds, *self.method.observation_shape), self.method.observation_dtype)
         self._reward = np.zeros(num_worlds, np.float32)
+        self.step_reward = np.zeros(num_worlds, np.float32)
+        self._running = np.zeros(num_worlds, np.bool_)
         self._outcome = np.zeros(num_worlds, np.int8)
         self._all = np.ones(num_worlds, np.bool_)
         self.seed(list(range(num_worlds)))
@@ -79,11 +98,14 @@ class WorldBatch:
         self.method.perceive(self.state, mask, self._observation)
         return self._observation.copy()
 
-    def step(self, action: NDArray[np.int64] | None) -> StepResult:
-        """Moves every world by one step; ended worlds are not restarted.
+    def step(self, action: NDArray[np.int64] | Pilot, watch: Callable[[], None] | None = None) -> StepResult:
+        """Takes one decision in every world: `decision_interval_steps` simulator steps with the same action.
+
+        A world whose episode ends within the interval stays as it ended. Ended worlds are not restarted.
 
         Args:
-          action: `[num_worlds]`, or None to let FL-ORCA drive the learning robot too.
+          action: `[num_worlds]`, or how FL-ORCA drives the learning robot too.
+          watch: called after each simulator step.
 
         Returns:
           StepResult of copies.
@@ -91,13 +113,15 @@ class WorldBatch:
         Raises:
           ValueError: there is not one action a world, or one is none of the actions.
         """
-        if action is None:
-            self.swarm_step()
-        else:
-            self.method.velocity(self.state, action, self._command_x, self._command_y)
-            advance(self.state, self.tile, self._command_x, self._command_y, True, self.swarm)
-        self.method.outcome(self.state, self._outcome)
-        self.method.reward(self.state, self._outcome, self._reward)
+        if action is Pilot.SNAPPED:
+            action = self.actions_nearest_to_swarm()
+        self._running[:], self._reward[:] = True, 0.0
+        for left in range(self.config.decision_interval_steps - 1, -1, -1):
+            self._simulate(action)
+            if watch is not None:
+                watch()
+            if left and not self._running.any():
+                break
         self.method.perceive(self.state, self._all, self._observation)
         return StepResult(
             self._observation.copy(),
@@ -107,9 +131,35 @@ class WorldBatch:
             self.state.episode_return.copy(),
         )
 
+    def _simulate(self, action: NDArray[np.int64] | Pilot) -> None:
+        """Moves the running worlds by one simulator step and adds its rewards."""
+        state, running, command = self.state, self._running, (self._command_x, self._command_y)
+        if isinstance(action, Pilot):
+            advance(state, self.tile, running, *command, False, self.swarm)
+        else:
+            self.method.velocity(state, action, *command)
+            advance(state, self.tile, running, *command, True, self.swarm)
+        self.method.outcome(state, running, self._outcome)
+        self.method.reward(state, running, self._outcome, self.step_reward)
+        np.add(self._reward, self.step_reward, out=self._reward, where=running)
+        np.logical_and(running, self._outcome == _RUNNING, out=running)
+
+    def actions_nearest_to_swarm(self) -> NDArray[np.int64]:
+        """The actions `[num_worlds]` whose velocities are nearest to those that FL-ORCA has for the learning robots."""
+        state = WorldState(*(array.copy() for array in self.state))
+        advance(state, self.tile, self._all, self._command_x, self._command_y, False, self.swarm)
+        world = np.arange(self.num_worlds)
+        wanted = np.stack([state.vel_x[world, state.learner], state.vel_y[world, state.learner]])
+        distance_sq = np.empty((self.config.num_actions, self.num_worlds))
+        velocity = np.empty((2, self.num_worlds), np.float32)
+        for action in range(self.config.num_actions):
+            self.method.velocity(self.state, np.full(self.num_worlds, action), velocity[0], velocity[1])
+            distance_sq[action] = np.square(velocity - wanted).sum(axis=0)
+        return np.asarray(distance_sq.argmin(axis=0), np.int64)
+
     def swarm_step(self) -> None:
-        """Moves every world by one step, the learning robot too, and nothing else: no outcome, no observation."""
-        advance(self.state, self.tile, self._command_x, self._command_y, False, self.swarm)
+        """Moves every world by one simulator step, the learning robot too, and nothing else: no outcome, no reward."""
+        advance(self.state, self.tile, self._all, self._command_x, self._command_y, False, self.swarm)
 
     def positions(self) -> NDArray[np.float32]:
         """Positions `[num_worlds, num_robots, 2]`, metres."""

@@ -24,7 +24,7 @@ from actors.service.rpc import Calls, Ref, by_reference
 from sim_core.checks import require
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
-from sim_core.worlds import WorldBatch, is_done
+from sim_core.worlds import Pilot, WorldBatch, is_done
 
 MAX_ENVS = 250
 """Most environments stepped together."""
@@ -113,12 +113,16 @@ def _get_result(
 
 
 class _Step(NamedTuple):
-    """Result of stepping every episode `[batch, ...]`; `outcome` is valid where an episode has ended."""
+    """Result of stepping every episode `[batch, ...]`; `outcome` is valid where an episode has ended.
+
+    `steps` are those of the episode so far, as EpisodeStats counts them.
+    """
 
     observation: NDArray[Any]
     reward: NDArray[np.float64]
     ended: NDArray[np.bool_]
     outcome: NDArray[np.int8]
+    steps: NDArray[np.int32]
 
 
 class _SwarmEpisodes:
@@ -134,19 +138,21 @@ class _SwarmEpisodes:
             reward=np.zeros(len(seeds)),
             ended=np.zeros(len(seeds), np.bool_),
             outcome=np.zeros(len(seeds), np.int8),
+            steps=np.zeros(len(seeds), np.int32),
         )
 
     def start(self) -> NDArray[Any]:
         return self._last.observation
 
-    def step(self, action: NDArray[np.int64] | None) -> _Step:
-        result = self._worlds.step(None if action is None else action[self._episode])
+    def step(self, action: NDArray[np.int64] | Pilot) -> _Step:
+        result = self._worlds.step(action if isinstance(action, Pilot) else action[self._episode])
         done = is_done(result.outcome)
         last, episode = self._last, self._episode
         last.observation[episode] = result.observation
         last.reward[episode] = result.reward
         last.ended[episode] = done
         last.outcome[episode] = result.outcome
+        last.steps[episode] = result.steps
         self._over |= done
         if self._over.mean() >= 0.5 and not self._over.all():
             self._drop_ended()
@@ -170,16 +176,18 @@ class _GymEpisodes:
     def __init__(self, spec: EnvSpec, seeds: list[int]) -> None:
         self._env = make_vector_env(spec, len(seeds))
         self._seeds = seeds
+        self._steps = np.zeros(len(seeds), np.int32)
 
     def start(self) -> NDArray[Any]:
         return reset_seeded(self._env, self._seeds)
 
-    def step(self, action: NDArray[np.int64] | None) -> _Step:
+    def step(self, action: NDArray[np.int64] | Pilot) -> _Step:
         observation, reward, terminated, truncated, infos = self._env.step(action)
         outcome = infos.get("final_info", {}).get("outcome")
         if outcome is None:
             outcome = np.full(len(self._seeds), NO_OUTCOME, np.int8)
-        return _Step(observation, reward, terminated | truncated, outcome)
+        self._steps += 1
+        return _Step(observation, reward, terminated | truncated, outcome, self._steps)
 
     def close(self) -> None:
         self._env.close()
@@ -192,31 +200,33 @@ def _play(spec: EnvSpec, rule: ActionRule, seeds: list[int]) -> EpisodeStats:
     observation = episodes.start()
     running = np.ones(count, np.bool_)
     while running.any():
-        observation, reward, done, outcome = episodes.step(rule.act(observation))
-        stats.length_steps[running] += 1
+        observation, reward, done, outcome, steps = episodes.step(rule.act(observation))
         stats.episode_return[running] += reward[running]
         ended = running & done
-        stats.outcome[ended] = outcome[ended]
+        stats.outcome[ended], stats.length_steps[ended] = outcome[ended], steps[ended]
         running &= ~ended
     episodes.close()
     return stats
 
 
 def record_episode(spec: EnvSpec, candidate: Candidate, seed: int) -> Episode:
-    """Plays one episode of the swarm environment and records every state."""
+    """Plays one episode of the swarm environment and records the state after every simulator step."""
     worlds = WorldBatch(spec.world, 1)
     rule = make_action_rule(spec, candidate, [seed])
     worlds.seed([seed])
     observation = worlds.reset()
     states, actions, rewards = [_state_of(worlds)], list[int](), list[float]()
     outcome = Outcome.RUNNING
+
+    def record() -> None:
+        states.append(_state_of(worlds))
+        actions.append(NO_ACTION if isinstance(action, Pilot) else int(action[0]))
+        rewards.append(float(worlds.step_reward[0]))
+
     while outcome == Outcome.RUNNING:
         action = rule.act(observation)
-        result = worlds.step(action)
+        result = worlds.step(action, record)
         observation, outcome = result.observation, Outcome(result.outcome[0])
-        states.append(_state_of(worlds))
-        actions.append(NO_ACTION if action is None else int(action[0]))
-        rewards.append(float(result.reward[0]))
     position, velocity, machine = (np.stack(column) for column in zip(*states, strict=True))
     return Episode(
         position=position,

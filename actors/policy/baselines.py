@@ -1,7 +1,8 @@
 """Rules that drive the learning robot and learn nothing: what learned policies are measured against.
 
 `fl-orca` drives it as every other robot of the swarm: it knows its goal and its neighbours' velocities, which the
-learning robot's observation does not hold. `greedy` is the method's own rule. `random` draws actions.
+learning robot's observation does not hold. `fl-orca-snapped` takes the nearest action to that, once a decision.
+`greedy` and `field` are the method's own rules, on its observation. `random` draws actions.
 """
 
 from __future__ import annotations
@@ -12,15 +13,16 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_core.checks import ConfigError
+from sim_core.checks import require
 from sim_core.config import WorldConfig
+from sim_core.worlds import Pilot
 
 
 class ActionRule(Protocol):
-    """Chooses the actions of a batch of episodes that were started together, one call an env step."""
+    """Chooses the actions of a batch of episodes that were started together, one call a decision."""
 
-    def act(self, observation: NDArray[Any]) -> NDArray[np.int64] | None:
-        """Actions `[batch]` for observations `[batch, *shape]`; None lets FL-ORCA drive the learning robots."""
+    def act(self, observation: NDArray[Any]) -> NDArray[np.int64] | Pilot:
+        """Actions `[batch]` for observations `[batch, *shape]`, or how FL-ORCA drives the learning robots."""
         ...
 
 
@@ -28,32 +30,51 @@ class Baseline(enum.StrEnum):
     """The baselines by the names that the command line knows."""
 
     FL_ORCA = "fl-orca"
+    FL_ORCA_SNAPPED = "fl-orca-snapped"
     GREEDY = "greedy"
+    FIELD = "field"
     RANDOM = "random"
 
 
+PILOTS = {Baseline.FL_ORCA: Pilot.FREE, Baseline.FL_ORCA_SNAPPED: Pilot.SNAPPED}
+METHOD_RULES = (Baseline.GREEDY, Baseline.FIELD)
+
+
+def exists(baseline: Baseline, config: WorldConfig) -> bool:
+    """Whether the world's method has this baseline."""
+    return baseline not in METHOD_RULES or baseline in config.method_class.rules(config)
+
+
 class FlOrcaRule:
-    """FL-ORCA itself, which obeys no action: one speed less heading, and waits where it must."""
+    """FL-ORCA itself, free or snapped to the actions.
 
-    def act(self, observation: NDArray[Any]) -> None:
-        """None; see ActionRule."""
+    Args:
+      pilot: which of the two.
+    """
+
+    def __init__(self, pilot: Pilot) -> None:
+        self._pilot = pilot
+
+    def act(self, observation: NDArray[Any]) -> Pilot:
+        """The pilot; see ActionRule."""
+        return self._pilot
 
 
-class GreedyMethodRule:
-    """The greedy rule of the world's method (`sim_core.methods.base.Method.greedy`).
+class MethodRule:
+    """A rule of the world's method (`sim_core.methods.base.Method.rules`).
 
     Args:
       config: the setup.
+      baseline: which.
 
     Raises:
-      ConfigError: the method has none.
+      ConfigError: the method has none of this name.
     """
 
-    def __init__(self, config: WorldConfig) -> None:
-        rule = config.method_class.greedy(config)
-        if rule is None:
-            raise ConfigError(f"method {config.method_name} has no greedy rule; play fl-orca or random")
-        self._rule = rule
+    def __init__(self, config: WorldConfig, baseline: Baseline) -> None:
+        others = ", ".join(other for other in Baseline if exists(other, config))
+        require(exists(baseline, config), f"method {config.method_name} has no rule {baseline}; play one of: {others}")
+        self._rule = config.method_class.rules(config)[baseline]
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.int64]:
         """Actions `[batch]` for observations `[batch, *shape]`."""
@@ -86,6 +107,6 @@ def make_baseline(baseline: Baseline, config: WorldConfig, seeds: list[int]) -> 
     Raises:
       ConfigError: the method has no such rule.
     """
-    if baseline is Baseline.FL_ORCA:
-        return FlOrcaRule()
-    return RandomRule(config, seeds) if baseline is Baseline.RANDOM else GreedyMethodRule(config)
+    if baseline in PILOTS:
+        return FlOrcaRule(PILOTS[baseline])
+    return RandomRule(config, seeds) if baseline is Baseline.RANDOM else MethodRule(config, baseline)

@@ -118,8 +118,10 @@ class RolloutWorker:
         self._length += 1
         self._return += reward
         if done.any():
-            ended.outcome[i] = infos.get("final_info", {}).get("outcome", NO_OUTCOME)
-            ended.length_steps[i], ended.episode_return[i] = self._length, self._return
+            final = infos.get("final_info", {})
+            ended.outcome[i] = final.get("outcome", NO_OUTCOME)
+            ended.length_steps[i] = final["episode_length"] if self._settings.env.is_swarm else self._length
+            ended.episode_return[i] = self._return
             self._length[done] = 0
             self._return[done] = 0.0
 

@@ -21,7 +21,10 @@ NO_OUTCOME = -1
 
 
 class EpisodeStats(NamedTuple):
-    """Statistics of finished episodes `[episodes]`: outcome, length in env steps, and undiscounted return."""
+    """Statistics of finished episodes `[episodes]`: outcome, length, and undiscounted return.
+
+    The length counts simulator steps in the swarm environment, env steps in others.
+    """
 
     outcome: NDArray[np.int8]
     length_steps: NDArray[np.int32]

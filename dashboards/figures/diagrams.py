@@ -29,7 +29,7 @@ from sim_core.methods.headings import heading_velocities
 from sim_core.methods.m_sensor import sector_edges
 from sim_core.outcomes import Outcome
 from sim_core.render import GROUP_COLOURS
-from sim_core.worlds import WorldBatch
+from sim_core.worlds import Pilot, WorldBatch
 
 DRAWN_SETUP = Setup(10, 3)
 """Robots per group, and groups, of the drawn worlds."""
@@ -57,7 +57,7 @@ def best_scene(config: WorldConfig, seed: int, score: Score) -> WorldBatch:
     best, saved = score(worlds), worlds.get_state()
     outcome = int(Outcome.RUNNING)
     while outcome == Outcome.RUNNING:
-        outcome = int(worlds.step(None).outcome[0])
+        outcome = int(worlds.step(Pilot.FREE).outcome[0])
         found = score(worlds)
         if found > best:
             best, saved = found, worlds.get_state()

@@ -19,9 +19,9 @@ class Compass(Method):
         return "x of the group", "y of the group", "x of the nearest other", "y of the nearest other"
 
     @classmethod
-    def greedy(cls, config):
+    def rules(cls, config):
         headings = cls(config).headings[: config.sectors]
-        return lambda observation: np.argmax(observation[:, :2] @ headings.T, axis=1)
+        return {"greedy": lambda observation: np.argmax(observation[:, :2] @ headings.T, axis=1)}
 
     def observe(self, state):
         learner = state.learner[:, None]

@@ -33,7 +33,7 @@ class Evaluate:
     """Play a run's greedy policy, or a baseline, on fixed seeds; print its rates with 95 % intervals."""
 
     run: Positional[str]
-    """Name of the run, or its folder; or fl-orca, greedy or random (a run with such a name: ./NAME)."""
+    """Name of the run, or its folder; or fl-orca, fl-orca-snapped, greedy, field or random (a run so named: ./NAME)."""
     episodes: int = 1_000
     """Episodes to play."""
     first_seed: int = 2_000_000_000

@@ -18,11 +18,12 @@ from learner.checkpoints.manifest import CheckpointError, damaged
 from learner.config import RunConfig
 from learner.update.learner_node import WEIGHTS
 
-ONLINE = "online."
+AVERAGE, ONLINE = "average.", "online."
+"""Networks of a checkpoint; the policy is the average where there is one."""
 
 
 def read_policy(checkpoint: Checkpoint, config: RunConfig, shape: EnvShape) -> WeightsSnapshot:
-    """The online network's weights of a checkpoint.
+    """The policy's weights of a checkpoint.
 
     Raises:
       CheckpointError: the weights do not fit a network of `config` on environments of `shape`.
@@ -60,7 +61,7 @@ def read_saved_policy(path: Path, config: RunConfig, shape: EnvShape) -> Weights
 
 def _read(path: Path, updates: int, network: QNetwork | DuelingNetwork) -> WeightsSnapshot:
     try:
-        network.load_state_dict(_online(load_file(str(path))))
+        network.load_state_dict(_policy(load_file(str(path))))
     except (RuntimeError, OSError, SafetensorError) as error:
         raise CheckpointError(
             f"the policy {path} takes other observations or actions than this setup: name a run whose "
@@ -70,5 +71,6 @@ def _read(path: Path, updates: int, network: QNetwork | DuelingNetwork) -> Weigh
     return snapshot(network, updates, 0.0)
 
 
-def _online(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name.removeprefix(ONLINE): tensor for name, tensor in tensors.items() if name.startswith(ONLINE)}
+def _policy(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    prefix = AVERAGE if any(name.startswith(AVERAGE) for name in tensors) else ONLINE
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}

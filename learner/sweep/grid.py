@@ -18,7 +18,7 @@ from sim_core.checks import ConfigError, check_fields, require
 from sim_core.config import WorldConfig
 from sim_core.plugins import DISSERTATION_METHODS, METHODS, find, short_name
 
-BaselineName = Literal["fl-orca", "greedy", "random"]
+BaselineName = Literal["fl-orca", "fl-orca-snapped", "greedy", "field", "random"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,10 +138,13 @@ class Cell(NamedTuple):
 
     @property
     def weight(self) -> float:
-        """Estimated relative cost: env steps x (robots + a constant for perception, and in training for learning)."""
-        robots, steps = self.config.world.num_robots, self.config.world.horizon_steps * self.config.final_eval_episodes
-        evaluation = steps * (robots + 10.0)
-        return evaluation + (self.config.total_env_steps * (robots + 60.0) if self.policy == LEARNED else 0.0)
+        """Estimated relative cost: robot steps, and a constant per decision for perception and for learning."""
+        world = self.config.world
+        robots, interval = world.num_robots, world.decision_interval_steps
+        decisions = world.horizon_steps / interval * self.config.final_eval_episodes
+        evaluation = decisions * (robots * interval + 10.0)
+        training = self.config.total_env_steps * (robots * interval + 60.0)
+        return evaluation + (training if self.policy == LEARNED else 0.0)
 
 
 ORIGINAL_DEFAULTS = {"steps_per_block": 32, "updates_per_call": 32}
@@ -236,8 +239,11 @@ def make_cells(sweep: SweepConfig) -> list[Cell]:
     Raises:
       ConfigError: a setup is impossible.
     """
+    from actors.policy.baselines import Baseline, exists  # imports kernels, which options do without
+
     setups = [(method, r, g) for method in sweep.methods for r in sweep.robots for g in sweep.groups]
-    rounds = [[make_baseline_cell(sweep, baseline, *setup) for setup in setups] for baseline in sweep.baselines]
+    played = [[make_baseline_cell(sweep, baseline, *setup) for setup in setups] for baseline in sweep.baselines]
+    rounds = [[cell for cell in cells if exists(Baseline(cell.policy), cell.config.world)] for cells in played]
     rounds += [[make_cell(sweep, *setup, seed) for setup in setups] for seed in sweep.seeds]
     return [cell for cells in rounds for cell in sorted(cells, key=lambda cell: cell.weight)]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 import numpy as np
@@ -32,6 +33,7 @@ class Learner:
 
     Attributes:
       online, target: the networks.
+      policy: the network that acts: the online network, or the moving average of its weights.
       optimiser: Adam over the online network's parameters.
       updates: made so far.
       td_errors: TD errors of the last call's rows, each before its update, `[rows]` float32.
@@ -47,7 +49,10 @@ class Learner:
         self.device = learning_device(config.device)
         self._online = FlatNetwork(online.to(self.device))
         self._target = self._online.copy()
+        self._average = self._online.copy() if config.policy_average_updates else None
+        self._average_updates = config.policy_average_updates
         self.online, self.target = self._online.network, self._target.network
+        self.policy = self.online if self._average is None else self._average.network
         self.optimiser = torch.optim.Adam([self._online.values], fused=True)
         by_hand = config.gradients == "by_hand"
         compilable = by_hand and config.network == "plain" and self.device.type == "cpu"
@@ -70,17 +75,22 @@ class Learner:
         if weights is not None:
             columns["weight"] = torch.from_numpy(weights)
         stats, self.td_errors = self._make_updates(columns, learning_rate, self.updates)
-        self.updates += len(self.td_errors) // self._batch_size
+        updates = len(self.td_errors) // self._batch_size
+        self.updates += updates
+        if self._average is not None:
+            self._average.values.data.lerp_(self._online.values.data, 1.0 - math.exp(-updates / self._average_updates))
         return stats
 
     def weights(self, time_s: float) -> WeightsSnapshot:
-        """The online network's weights, published at `time_s`."""
-        return snapshot(self.online, self.updates, time_s)
+        """The policy's weights, published at `time_s`."""
+        return snapshot(self.policy, self.updates, time_s)
 
     def get_state(self) -> dict[str, Tensor]:
         """A copy of all tensors that a checkpoint needs, by name."""
         state = {f"online.{name}": tensor for name, tensor in self.online.state_dict().items()}
         state |= {f"target.{name}": tensor for name, tensor in self.target.state_dict().items()}
+        if self._average is not None:
+            state |= {f"average.{name}": tensor for name, tensor in self.policy.state_dict().items()}
         for name, tensor in self.optimiser.state.get(self._online.values, {}).items():
             state[f"optimiser.{name}"] = tensor
         state["updates"] = torch.tensor(self.updates)
@@ -95,6 +105,8 @@ class Learner:
         try:
             self.online.load_state_dict(_with_prefix(state, "online."))
             self.target.load_state_dict(_with_prefix(state, "target."))
+            if self._average is not None:
+                self.policy.load_state_dict(_with_prefix(state, "average."))
         except RuntimeError as error:
             raise ValueError(f"the saved networks have another shape: {str(error).splitlines()[-1].strip()}") from error
         adam = _with_prefix(state, "optimiser.")

@@ -24,7 +24,7 @@ from sim_core.state import WorldState, own_group
 
 _GOAL, _RUNNING, _TIMEOUT = int(Outcome.GOAL), int(Outcome.RUNNING), int(Outcome.TIMEOUT)
 
-GreedyRule = Callable[[NDArray[Any]], NDArray[np.int64]]
+Rule = Callable[[NDArray[Any]], NDArray[np.int64]]
 """Observations `[batch, *observation_shape]` to actions `[batch]`."""
 
 
@@ -68,9 +68,11 @@ def episode_params(config: WorldConfig) -> EpisodeParams:
 
 
 @kernel
-def _outcome(state, out, params):
+def _outcome(state, mask, out, params):
     p = params[0]
     for world in range(out.shape[0]):
+        if not mask[world]:
+            continue
         group, begin, end = own_group(state, world)
         ended = end_of_step(
             state.learner[world],
@@ -90,9 +92,11 @@ def _outcome(state, out, params):
 
 
 @kernel
-def _reward(state, outcome, out, params):
+def _reward(state, mask, outcome, out, params):
     p = params[0]
     for world in range(out.shape[0]):
+        if not mask[world]:
+            continue
         closer = came_closer(state, world)
         if outcome[world] == _RUNNING or (outcome[world] == _TIMEOUT and not p.timeout_fails):
             clock = state.steps[world] if p.clock_is_step else p.horizon_steps
@@ -158,9 +162,9 @@ class Method:
         return config.learner_speed_m_s
 
     @classmethod
-    def greedy(cls, config: WorldConfig) -> GreedyRule | None:
-        """A rule that learns nothing, to measure policies against; None if there is none."""
-        return None
+    def rules(cls, config: WorldConfig) -> dict[str, Rule]:
+        """Rules on the observation that learn nothing, to measure policies against: `greedy` and `field`, or fewer."""
+        return {}
 
     def observe(self, state: WorldState) -> NDArray[Any]:
         """Observations `[num_worlds, size]` of all worlds, in plain numpy; a method with kernels defines `perceive`."""
@@ -181,21 +185,27 @@ class Method:
         """
         write_headings(self.headings, action, out_x, out_y)
 
-    def outcome(self, state: WorldState, out: NDArray[np.int8]) -> None:
-        """Writes each world's Outcome `[num_worlds]` after a step; called once a step, it may count steps.
+    def outcome(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
+        """Writes the Outcome `[num_worlds]` after a simulator step of the worlds where `mask` is set.
+
+        It is called once a step, so it may count steps.
 
         By default that of 3.2.1: goal, collision, lost or captured as soon as no own robot is sensed; timeout at the
         horizon.
         """
-        _outcome(state, out, self.episode_params)
+        _outcome(state, mask, out, self.episode_params)
 
-    def reward(self, state: WorldState, outcome: NDArray[np.int8], out: NDArray[np.float32]) -> None:
-        """Writes the rewards `[num_worlds]` of the step and adds them to `state.episode_return`.
+    def reward(
+        self, state: WorldState, mask: NDArray[np.bool_], outcome: NDArray[np.int8], out: NDArray[np.float32]
+    ) -> None:
+        """Writes the rewards `[num_worlds]` of a simulator step of the worlds where `mask` is set.
+
+        It adds them to `state.episode_return`.
 
         By default Table 3.1, with the robot's own distance to the goal as "closer"; a timeout that is no failure is a
         step.
         """
-        _reward(state, outcome, out, self.episode_params)
+        _reward(state, mask, outcome, out, self.episode_params)
 
 
 class CheckedMethod(Method):
@@ -245,24 +255,26 @@ class CheckedMethod(Method):
                 self._cls, "velocity", f"gave a speed of {fastest:.3g} m/s, beyond top_speed_m_s {self._top_speed_m_s}"
             )
 
-    def outcome(self, state: WorldState, out: NDArray[np.int8]) -> None:
+    def outcome(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
         """As `Method.outcome`.
 
         Raises:
           PluginError: the user's code raised, or gave what is no Outcome.
         """
         with guarded(self._cls, "outcome"):
-            self._method.outcome(state, out)
+            self._method.outcome(state, mask, out)
         if out.min(initial=0) < 0 or out.max(initial=0) >= len(Outcome):
             raise refuse(self._cls, "outcome", f"gave {sorted(set(out.tolist()))}, not all of sim_core.Outcome")
 
-    def reward(self, state: WorldState, outcome: NDArray[np.int8], out: NDArray[np.float32]) -> None:
+    def reward(
+        self, state: WorldState, mask: NDArray[np.bool_], outcome: NDArray[np.int8], out: NDArray[np.float32]
+    ) -> None:
         """As `Method.reward`.
 
         Raises:
           PluginError: the user's code raised, or gave a reward that is not finite.
         """
         with guarded(self._cls, "reward"):
-            self._method.reward(state, outcome, out)
+            self._method.reward(state, mask, outcome, out)
         if not np.isfinite(out).all():
             raise refuse(self._cls, "reward", "gave a reward that is not finite")

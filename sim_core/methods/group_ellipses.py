@@ -21,7 +21,7 @@ from sim_core.checks import require
 from sim_core.config import WorldConfig
 from sim_core.jit import kernel
 from sim_core.methods.apf import FieldParams, field_of, field_params
-from sim_core.methods.base import EpisodeParams, GreedyRule, Method, Preset, episode_params
+from sim_core.methods.base import EpisodeParams, Method, Preset, Rule, episode_params
 from sim_core.methods.ellipse import (
     NOBODY,
     EllipseParams,
@@ -115,9 +115,11 @@ def _perceive(state, mask, out, order, distance_sq, params):
 
 
 @kernel
-def _outcome(state, out, params):
+def _outcome(state, mask, out, params):
     p, e = params[0], params[0].episode
     for world in range(out.shape[0]):
+        if not mask[world]:
+            continue
         pos_x, pos_y, learner = state.pos_x[world], state.pos_y[world], state.learner[world]
         group, begin, end = own_group(state, world)
         inside = in_own_ellipse(learner, begin, end, pos_x, pos_y, p.ellipse)
@@ -132,9 +134,11 @@ def _outcome(state, out, params):
 
 
 @kernel
-def _reward(state, outcome, out, params):
+def _reward(state, mask, outcome, out, params):
     e = params[0].episode
     for world in range(out.shape[0]):
+        if not mask[world]:
+            continue
         closer = came_closer(state, world) if e.rewards_progress else True
         if outcome[world] == _RUNNING or (outcome[world] == _TIMEOUT and not e.timeout_fails):
             share = e.reward_scale / STEP_REWARD_SHARE
@@ -220,24 +224,26 @@ class EllipseMethod(Method):
         )
 
     @classmethod
-    def greedy(cls, config: WorldConfig) -> GreedyRule:
-        """The heading nearest to the direction of the own group's centre; the lowest index among equals."""
+    def rules(cls, config: WorldConfig) -> dict[str, Rule]:
+        """`greedy`: the heading nearest to the direction of the own group's centre; the lowest index among equals."""
         headings = heading_velocities(config, np.float64)[: config.sectors]
 
         def act(observation: NDArray[Any]) -> NDArray[np.int64]:
             centre = observation[:, 2:4].astype(np.float64)
             return np.asarray(np.argmax(centre @ headings.T, axis=1), np.int64)
 
-        return act
+        return {"greedy": act}
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.float32]) -> None:
         """4.2.1: the state matrix `[num_worlds, groups * columns]`, row after row."""
         _perceive(state, mask, out, self._order, self._distance_sq, self._params)
 
-    def outcome(self, state: WorldState, out: NDArray[np.int8]) -> None:
+    def outcome(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
         """4.2.1: goal, collision, lost or captured after phi steps outside, timeout; counts `outside_steps`."""
-        _outcome(state, out, self._params)
+        _outcome(state, mask, out, self._params)
 
-    def reward(self, state: WorldState, outcome: NDArray[np.int8], out: NDArray[np.float32]) -> None:
+    def reward(
+        self, state: WorldState, mask: NDArray[np.bool_], outcome: NDArray[np.int8], out: NDArray[np.float32]
+    ) -> None:
         """Table 4.1: +tau/100 inside the own ellipse (see `ellipse_reward`), -tau/100 outside, +-tau at the end."""
-        _reward(state, outcome, out, self._params)
+        _reward(state, mask, outcome, out, self._params)

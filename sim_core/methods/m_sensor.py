@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sim_core.config import WorldConfig
 from sim_core.jit import kernel
-from sim_core.methods.base import GreedyRule, Method, Preset
+from sim_core.methods.base import Method, Preset, Rule
 from sim_core.methods.progress import goal_offset
 from sim_core.packed import packed
 from sim_core.state import WorldState, own_group
@@ -147,8 +147,8 @@ class SensorMethod(Method):
         """Every setting works: sectors may be in the world's frame or the goal's."""
 
     @classmethod
-    def greedy(cls, config: WorldConfig) -> GreedyRule:
-        """Heads into the sector with the most own robots less other robots, over both sensing regions.
+    def rules(cls, config: WorldConfig) -> dict[str, Rule]:
+        """`greedy` heads into the sector with the most own robots less other robots, over both sensing regions.
 
         Among equal sectors, the one with the most in the outer ring: its robots are those that are about to be lost.
         Among these, the lowest index, as a learned policy does.
@@ -162,7 +162,7 @@ class SensorMethod(Method):
             size = 2 * np.abs(ring).max(initial=0) + 1  # more than two rings can differ by
             return np.asarray(np.argmax(size * (inner + ring) + ring, axis=1), np.int64)
 
-        return act
+        return {"greedy": act}
 
     def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
         """Eq. 3.4: constant speed towards the chosen sector's centre, in the frame of the sectors.

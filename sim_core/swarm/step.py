@@ -183,12 +183,13 @@ def move_world(world, first_slot, state, tile, command_x, command_y, use_command
 
 
 @kernel
-def advance(state, tile, command_x, command_y, use_command, params):
-    """Advances every world by one step.
+def advance(state, tile, mask, command_x, command_y, use_command, params):
+    """Advances worlds by one simulator step.
 
     Args:
       state: WorldState, changed in place.
       tile: Tile.
+      mask: `[num_worlds]` bool, the worlds to advance; the others stay as they are.
       command_x, command_y: `[num_worlds]`, the learning robot's velocity, m/s.
       use_command: whether the learning robot moves with the command; else FL-ORCA drives it too.
       params: SwarmParams, packed.
@@ -197,10 +198,13 @@ def advance(state, tile, command_x, command_y, use_command, params):
     num_worlds, num_robots = state.pos_x.shape
     for first_world in range(0, num_worlds, p.worlds_per_tile):
         worlds = min(p.worlds_per_tile, num_worlds - first_world)
+        if not mask[first_world : first_world + worlds].any():
+            continue
         rows = load_tile(first_world, worlds, state, tile, p)
         compute_velocities(first_world // p.worlds_per_tile, worlds * num_robots, rows, tile, state.rng, p)
         for i in range(worlds):
-            move_world(first_world + i, i * num_robots, state, tile, command_x, command_y, use_command, p)
+            if mask[first_world + i]:
+                move_world(first_world + i, i * num_robots, state, tile, command_x, command_y, use_command, p)
 
 
 @kernel

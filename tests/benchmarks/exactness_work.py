@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from sim_core.config import WorldConfig
-from sim_core.worlds import WorldBatch
+from sim_core.worlds import Pilot, WorldBatch
 from tests.sim_core.orca_scenes import goal_scene, heading_scene, numbered_scene, world_scene
 from tests.sim_core.parity import Parity, compare, total
 from tests.sim_core.precision import drifts, one_step_difference
@@ -36,7 +36,7 @@ def kernel_parity(robots: int, groups: int, seeds: range, every: int) -> Parity:
     for step in range(WHOLE_STEPS):
         if step % every == 0:
             found += [compare(heading_scene(worlds, world, rng)) for world in range(len(seeds))]
-        worlds.step(None)
+        worlds.step(Pilot.FREE)
     return total(found)
 
 
@@ -45,7 +45,7 @@ def world_parity(robots: int, groups: int, seeds: range, every: int) -> Parity:
     worlds, found = fresh_worlds(robots, groups, seeds, flocking="none"), []
     for step in range(WHOLE_STEPS):
         before = [goal_scene(worlds, world) for world in range(len(seeds))] if step % every == 0 else []
-        worlds.step(None)
+        worlds.step(Pilot.FREE)
         found += [compare(scene, world_scene(worlds, world).vel) for world, scene in enumerate(before)]
     return total(found)
 
@@ -61,7 +61,7 @@ def episode_precision(robots: int, groups: int, seeds: range, starts: tuple[int,
     for step in range(max(starts) + 1):
         if step in starts:
             found += [drifts(*world_scene(worlds, world)) for world in range(len(seeds))]
-        worlds.step(None)
+        worlds.step(Pilot.FREE)
     return np.concatenate(found, axis=1)
 
 
@@ -97,7 +97,7 @@ def swarm_episodes(robots: int, groups: int, seeds: range, settings: dict[str, A
     arrival, segregated = np.full(count, WHOLE_STEPS + 1), []
     limits = np.full(count, config.max_speed_m_s)
     for step in range(1, WHOLE_STEPS + 1):
-        worlds.step(None)
+        worlds.step(Pilot.FREE)
         pos, state = worlds.positions(), worlds.get_state()
         nearest_pairs_sq(np.ascontiguousarray(pos[..., 0]), np.ascontiguousarray(pos[..., 1]), near_sq)
         nearest_sq = np.minimum(nearest_sq, near_sq)

@@ -11,7 +11,7 @@ import pytest
 from actors.evaluation.trajectory import Episode
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
-from sim_core.worlds import WorldBatch
+from sim_core.worlds import Pilot, WorldBatch
 from tests.dashboards.chromium import open_chromium
 
 Recorder = Callable[..., Episode]
@@ -26,7 +26,7 @@ def record_episode(config: WorldConfig, seed: int, action: int | None = None) ->
     rewards: list[float] = []
     outcome = Outcome.RUNNING
     while outcome == Outcome.RUNNING:
-        result = worlds.step(None if action is None else np.array([action]))
+        result = worlds.step(Pilot.FREE if action is None else np.array([action]))
         outcome = Outcome(result.outcome[0])
         states.append(_state(worlds))
         rewards.append(float(result.reward[0]))

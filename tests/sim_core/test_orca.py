@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim_core.config import WorldConfig
-from sim_core.worlds import WorldBatch
+from sim_core.worlds import Pilot, WorldBatch
 from tests.sim_core.kernels import orca_velocities
 from tests.sim_core.orca_scenes import (
     GENERIC_KINDS,
@@ -99,7 +99,7 @@ def test_every_tenth_step_of_an_episode_matches_rvo2(robots, groups, arena_radiu
     worlds.reset()
     rng, found = np.random.default_rng(robots), []
     for step in range(400):
-        worlds.step(None)
+        worlds.step(Pilot.FREE)
         if step % 10 == 0:
             found.append(compare(heading_scene(worlds, 0, rng)))
     found = total(found)
@@ -114,7 +114,7 @@ def test_worlds_without_flocking_move_as_rvo2_does(robots, groups, arena_radius_
     worlds.reset()
     for step in range(300):
         before = [goal_scene(worlds, world) for world in range(3)] if step % 10 == 0 else []
-        worlds.step(None)
+        worlds.step(Pilot.FREE)
         found += [compare(scene, world_scene(worlds, world).vel) for world, scene in enumerate(before)]
     found = total(found)
     assert found.robots == 90 * config.num_robots and found.infeasible > 0

@@ -14,7 +14,7 @@ import deploy
 from sim_core import ENV_ID, ConfigError, WorldConfig
 from sim_core.plugins import SOURCES, PluginError
 from sim_core.render import draw_world
-from sim_core.worlds import WorldBatch, rehearse
+from sim_core.worlds import Pilot, WorldBatch, rehearse
 
 EXAMPLES = Path(deploy.__file__).parent / "examples"
 COMPASS, FAST_COMPASS = f"{EXAMPLES}/compass.py:Compass", f"{EXAMPLES}/compass_kernel.py:FastCompass"
@@ -129,7 +129,7 @@ def test_every_method_and_the_swarm_alone_play_in_groups_of_unequal_size(method)
     worlds = WorldBatch(config, 5)
     worlds.reset()
     for _ in range(400):
-        result = worlds.step(None)
+        result = worlds.step(Pilot.FREE)
     assert (np.linalg.norm(worlds.positions()[:, :8] - worlds.goals()[:, :1], axis=-1).mean(1) < 1.5).all()
     assert np.isfinite(result.observation).all()
 
@@ -201,12 +201,12 @@ BROKEN_METHODS = {
     "no names": ("def observe(self, state):\n    return 0", r"observation_names"),
     "reward": (
         NAMES + "def observe(self, state):\n    return np.zeros((len(state.learner), 2))\n"
-        "def reward(self, state, outcome, out):\n    out[:] = np.inf",
+        "def reward(self, state, mask, outcome, out):\n    out[:] = np.inf",
         r"mine.py, line 12: reward of Mine gave a reward that is not finite",
     ),
     "outcome": (
         NAMES + "def observe(self, state):\n    return np.zeros((len(state.learner), 2))\n"
-        "def outcome(self, state, out):\n    out[:] = 9",
+        "def outcome(self, state, mask, out):\n    out[:] = 9",
         r"mine.py, line 12: outcome of Mine gave \[9\]",
     ),
     "speed": (

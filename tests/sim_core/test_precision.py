@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sim_core.config import WorldConfig
-from sim_core.worlds import WorldBatch
+from sim_core.worlds import Pilot, WorldBatch
 from tests.sim_core.orca_scenes import KINDS, numbered_scene, world_scene
 from tests.sim_core.precision import drifts, one_step_difference
 
@@ -28,7 +28,7 @@ def test_float32_drifts_from_float64_slowly(robots, groups):
     for step in range(200):
         if step % 50 == 0:
             found += [drifts(*world_scene(worlds, world)) for world in range(4)]
-        worlds.step(None)
+        worlds.step(Pilot.FREE)
     after_1, after_10, _ = np.concatenate(found, axis=1)
     assert np.median(after_1) < 5e-7 and np.quantile(after_1, 0.99) < 1e-5
     assert np.median(after_10) < 5e-6 and np.quantile(after_10, 0.9) < 1e-3

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_core.config import WorldConfig
-from sim_core.worlds import WorldBatch
+from sim_core.worlds import Pilot, WorldBatch
 
 STEPS, MAX_WORLDS = 50, 17
 SETUPS = {  # robots, groups, arena radius (m; small, so that groups meet soon), whether the swarm knows the learner
@@ -66,7 +66,7 @@ def test_robots_of_these_worlds_meet(name):
     worlds = batch(name, list(range(4)))
     nearest_m = np.inf
     for _ in range(STEPS):
-        worlds.step(None)
+        worlds.step(Pilot.FREE)
         pos = worlds.positions()
         distance_m = np.linalg.norm(pos[:, :, None] - pos[:, None], axis=-1)
         nearest_m = min(nearest_m, distance_m[distance_m > 0].min())
@@ -97,7 +97,7 @@ def test_an_unknown_learning_robot_at_any_position_changes_no_other_robot(robots
         state["pos_x"][rows, learner], state["pos_y"][rows, learner] = np.transpose(positions)
         state["vel_x"][rows, learner], state["vel_y"][rows, learner] = rng.normal(0, 10, (2, num_worlds))
         displaced.set_state(state)
-        plain.step(None), displaced.step(None)
+        plain.step(Pilot.FREE), displaced.step(Pilot.FREE)
         expected, found = plain.get_state(), displaced.get_state()
         np.testing.assert_array_equal(found["rng"], expected["rng"])
         for name in ("pos_x", "pos_y", "vel_x", "vel_y", "machine"):

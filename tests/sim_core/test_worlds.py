@@ -5,7 +5,7 @@ import pytest
 
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
-from sim_core.worlds import WorldBatch, is_done, is_terminated
+from sim_core.worlds import Pilot, WorldBatch, is_done, is_terminated
 
 SEEDS = list(range(40, 48))
 SETTINGS = {"robots": 5, "groups": 2, "arena_radius_m": 2.0}
@@ -86,7 +86,7 @@ def test_the_swarm_reacts_to_the_learning_robot_only_if_it_knows_it(known, flock
     runs = []
     for seed in (1, 2, None):  # two random pilots, and FL-ORCA
         worlds = batch(SEEDS, swarm_knows_learner="yes" if known else "no", flocking=flocking)
-        plan = [None] * 120 if seed is None else actions(120, 8, seed)
+        plan = [Pilot.FREE] * 120 if seed is None else actions(120, 8, seed)
         path = np.array([pos for _, pos in run(worlds, plan)])
         keep = np.arange(10) != worlds.state.learner[:, None]
         runs.append((path[:, keep], path[:, ~keep]))
@@ -182,12 +182,51 @@ def test_actions_are_checked():
 def test_the_horizon_cuts_at_its_step_exactly():
     worlds = batch([1, 2], arena_radius_m=6.0, horizon_steps=7)
     for step in range(1, 8):
-        result = worlds.step(None)
+        result = worlds.step(Pilot.FREE)
         assert result.steps.tolist() == [step, step]
         expected = Outcome.TIMEOUT if step == 7 else Outcome.RUNNING
         assert result.outcome.tolist() == [expected] * 2
     assert is_done(result.outcome).all() and not is_terminated(result.outcome, False).any()
     assert is_terminated(result.outcome, True).all()
+
+
+@pytest.mark.parametrize(
+    ("method", "settings"),
+    [
+        ("sensor", {"sector_frame": "goal", "horizon_steps": 90}),
+        ("in", {"outside_limit_steps": 3}),
+        ("out", {"outside_limit_steps": 3, "learner_speed_limit_m_s": 1.5}),
+    ],
+)
+@pytest.mark.parametrize("interval", [4, 7])
+def test_a_decision_is_so_many_steps_with_one_action(method, settings, interval):
+    count, decisions = 48, 120 // interval
+    settings = settings | {"method": method}
+    chosen = actions(decisions, count)
+    slow, fast = batch(range(count), **settings, decision_interval_steps=interval), batch(range(count), **settings)
+    ended = np.zeros(count, np.bool_)
+    for action in chosen:
+        watched = []
+        result = slow.step(action, lambda seen=watched: seen.append(slow.positions()))
+        reward, over, last = np.zeros(count, np.float32), ended.copy(), {}
+        for inner in range(interval):
+            step = fast.step(action)
+            reward[~over] += step.reward[~over]
+            for world in np.flatnonzero(is_done(step.outcome) & ~over):
+                last[world] = (step, {name: array[world].copy() for name, array in fast.get_state().items()})
+            if inner < len(watched):
+                np.testing.assert_array_equal(watched[inner][~over], fast.positions()[~over])
+            over |= is_done(step.outcome)
+        now = fast.get_state()
+        for world in np.flatnonzero(~ended):
+            end, state = last.get(world, (step, {name: array[world] for name, array in now.items()}))
+            assert result.outcome[world] == end.outcome[world] and result.reward[world] == reward[world]
+            assert result.steps[world] == end.steps[world] and result.episode_return[world] == end.episode_return[world]
+            np.testing.assert_array_equal(result.observation[world], end.observation[world])
+            for name, array in slow.get_state().items():
+                np.testing.assert_array_equal(array[world], state[name], err_msg=name)
+        ended = over
+    assert ended.sum() > 5 and (slow.state.steps[ended] % interval).any()
 
 
 def test_what_is_terminal():
@@ -203,7 +242,7 @@ def test_returns_add_up_and_restart():
         total += result.reward
         np.testing.assert_allclose(result.episode_return, total, rtol=1e-5)
     worlds.reset()
-    result = worlds.step(None)
+    result = worlds.step(Pilot.FREE)
     np.testing.assert_allclose(result.episode_return, result.reward)
 
 
@@ -216,7 +255,7 @@ def test_the_swarm_alone_arrives_and_never_collides(flocking):
     nearest_m, outcome = np.inf, np.zeros(num_worlds, np.int8)
     pairs = np.triu_indices(20, 1)
     for _ in range(worlds.config.horizon_steps):
-        result = worlds.step(None)
+        result = worlds.step(Pilot.FREE)
         running = outcome == Outcome.RUNNING
         outcome[running] = result.outcome[running]
         pos = worlds.positions()

@@ -8,7 +8,7 @@ import pytest
 
 from actors.evaluation import evaluator
 from actors.evaluation.evaluator import evaluate, evaluate_in_parallel, record_episode, record_frames
-from actors.policy.baselines import Baseline
+from actors.policy.baselines import PILOTS, Baseline
 from actors.policy.policy import Policy
 from actors.rollout.vector_env import EnvSpec
 from actors.service.messages import NO_OUTCOME
@@ -18,7 +18,7 @@ from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 from sim_core.envs import SwarmEnv
 from sim_core.outcomes import Outcome
-from sim_core.worlds import WorldBatch
+from sim_core.worlds import Pilot, WorldBatch
 
 SEEDS = [2_000_000_000 + i for i in range(7)]
 
@@ -63,9 +63,15 @@ def test_entries_are_in_the_order_of_the_seeds(swarm, make_weights):
     assert [len(column) for column in evaluate(swarm, weights, [])] == [0, 0, 0]
 
 
+def with_rule(spec, baseline):
+    """The environment, with a method that has the baseline."""
+    return spec._replace(world=dataclasses.replace(spec.world, method="in")) if baseline == "field" else spec
+
+
 @pytest.mark.parametrize("max_calls", [1, 2, 3, 5, 7, 20])
 @pytest.mark.parametrize("name", ["learned", *Baseline])
 def test_a_parallel_evaluation_equals_the_whole_in_the_order_of_the_seeds(swarm, make_weights, name, max_calls):
+    swarm = with_rule(swarm, name)
     spec = swarm._replace(world=dataclasses.replace(swarm.world, horizon_steps=100))
     candidate = make_weights(spec) if name == "learned" else Baseline(name)
     calls = LocalCalls()
@@ -91,9 +97,9 @@ def test_the_fl_orca_baseline_steps_the_swarm_without_an_action(method):
         worlds = WorldBatch(world, 1)
         worlds.seed([seed])
         worlds.reset()
-        result = worlds.step(None)
+        result = worlds.step(Pilot.FREE)
         while result.outcome[0] == Outcome.RUNNING:
-            result = worlds.step(None)
+            result = worlds.step(Pilot.FREE)
         assert (stats.outcome[i], stats.length_steps[i]) == (result.outcome[0], result.steps[0])
         assert stats.episode_return[i] == pytest.approx(result.episode_return[0], rel=1e-6)
     assert len(set(stats.length_steps)) > 1
@@ -102,6 +108,7 @@ def test_the_fl_orca_baseline_steps_the_swarm_without_an_action(method):
 @pytest.mark.parametrize("baseline", Baseline)
 @pytest.mark.parametrize("chunk", [1, 3])
 def test_a_baseline_does_not_depend_on_the_number_of_environments(monkeypatch, swarm, baseline, chunk):
+    swarm = with_rule(swarm, baseline)
     expected = evaluate(swarm, baseline, SEEDS)
     monkeypatch.setattr(evaluator, "MAX_ENVS", chunk)
     for first, second in zip(evaluate(swarm, baseline, SEEDS), expected, strict=True):
@@ -110,11 +117,12 @@ def test_a_baseline_does_not_depend_on_the_number_of_environments(monkeypatch, s
 
 @pytest.mark.parametrize("baseline", Baseline)
 def test_a_recorded_baseline_equals_the_evaluated_one(swarm, baseline):
+    swarm = with_rule(swarm, baseline)
     stats = evaluate(swarm, baseline, SEEDS)
     for i, seed in enumerate(SEEDS):
         episode = record_episode(swarm, baseline, seed)
         assert (episode.outcome, len(episode.action)) == (stats.outcome[i], stats.length_steps[i] + 1)
-        assert ((episode.action[:-1] == -1) == (baseline is Baseline.FL_ORCA)).all()
+        assert ((episode.action[:-1] == -1) == (baseline in PILOTS)).all()
 
 
 def test_a_baseline_in_another_environment_is_refused(cart_pole):

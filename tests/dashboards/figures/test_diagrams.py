@@ -30,7 +30,7 @@ from dashboards.figures.diagrams import (
 from dashboards.figures.style import save_png
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
-from sim_core.worlds import WorldBatch
+from sim_core.worlds import Pilot, WorldBatch
 
 SENSOR_WORLD = WorldConfig(robots=10, groups=3, method="sensor")
 OUTSIDE_WORLD = WorldConfig(robots=10, groups=3, method="out", learner_speed_limit_m_s=1.2)
@@ -65,7 +65,7 @@ def test_the_scene_is_the_step_with_most_robots_in_range(near: WorldBatch):
     worlds.reset()
     most, at, outcome = robots_near(worlds), 0, int(Outcome.RUNNING)
     while outcome == Outcome.RUNNING:
-        outcome = int(worlds.step(None).outcome[0])
+        outcome = int(worlds.step(Pilot.FREE).outcome[0])
         offsets, _, _ = seen_by_hand(worlds)
         found = np.sum(np.hypot(*offsets.T) < SENSOR_WORLD.outer_radius_m)
         if found > most:

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import math
 
 import gymnasium as gym
 import numpy as np
@@ -68,6 +69,7 @@ OPTIONS = [
     {"network": "dueling"},
     {"target_update": "soft", "target_update_rate": 0.3},
     {"loss": "mse", "network": "dueling", "target_update": "soft", "target_update_rate": 0.02},
+    {"policy_average_updates": 3},
 ]
 
 
@@ -139,6 +141,22 @@ def test_a_soft_target_is_the_exponential_average_of_the_online_networks(make_le
     expected = (1 - rate) ** 6 * start
     expected += sum(rate * (1 - rate) ** (5 - i) * weight for i, weight in enumerate(online))
     torch.testing.assert_close(learner.target.layers[0].weight.detach(), expected, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("network", ["plain", "dueling"])
+def test_the_policy_is_the_moving_average_of_the_online_networks(make_learner, make_rows, network):
+    learner, kept = make_learner(policy_average_updates=4, network=network), math.exp(-1 / 4)
+    average = [parameter.detach().clone() for parameter in learner.online.parameters()]
+    for update in range(6):
+        learner.update(make_rows(16, seed=update), RATE)
+        new = learner.online.parameters()
+        average = [kept * mean + (1 - kept) * parameter.detach() for mean, parameter in zip(average, new, strict=True)]
+    for parameter, mean in zip(learner.policy.parameters(), average, strict=True):
+        torch.testing.assert_close(parameter.detach(), mean, rtol=1e-5, atol=1e-7)
+    published = Policy(learner.weights(0.0)).values(make_rows(16)["observation"])
+    inputs = torch.from_numpy(make_rows(16)["observation"].astype(np.float32))
+    torch.testing.assert_close(torch.from_numpy(published), learner.policy(inputs).detach(), rtol=1e-4, atol=1e-5)
+    assert not torch.equal(learner.policy(inputs), learner.online(inputs))
 
 
 def test_a_soft_target_at_rate_1_is_the_online_network(make_learner, make_rows):

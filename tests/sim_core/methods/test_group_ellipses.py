@@ -179,8 +179,8 @@ def step(config, state):
     """Outcome and reward of the state as a step's result."""
     method, outcome, reward = make_method(config), np.zeros(1, np.int8), np.zeros(1, REAL)
     state.steps[0] += 1
-    method.outcome(state, outcome)
-    method.reward(state, outcome, reward)
+    method.outcome(state, ALL, outcome)
+    method.reward(state, ALL, outcome, reward)
     return Outcome(outcome[0]), float(reward[0])
 
 

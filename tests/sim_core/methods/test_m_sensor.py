@@ -216,7 +216,7 @@ def test_table_3_1(outcome, closer, by_step, by_horizon, clock, make_state):
     state.goal_distance_m[0] = 4.1 if closer else 3.9
     state.steps[0], state.episode_return[0] = 8, 10.0
     reward = np.zeros(1, REAL)
-    make_method(config).reward(state, np.array([outcome], np.int8), reward)
+    make_method(config).reward(state, ALL, np.array([outcome], np.int8), reward)
     expected = by_step if clock == "step" else by_horizon
     assert reward[0] == pytest.approx(expected)
     assert state.episode_return[0] == pytest.approx(10 + expected)
@@ -227,7 +227,7 @@ def test_a_timeout_that_is_a_failure(make_state):
     config = WorldConfig(robots=2, groups=1, horizon_is="failure")
     state, reward = make_state(config, [(0, 0), (1, 0)], [(4, 0)]), np.zeros(1, REAL)
     state.goal_distance_m[0], state.steps[0] = 5.0, 500
-    make_method(config).reward(state, np.array([Outcome.TIMEOUT], np.int8), reward)
+    make_method(config).reward(state, ALL, np.array([Outcome.TIMEOUT], np.int8), reward)
     assert reward[0] == -1
 
 
@@ -236,7 +236,7 @@ def test_an_equal_distance_is_not_closer(make_state):
     state = make_state(config, [(0, 0), (1, 0)], [(4, 0)])
     state.goal_distance_m[0], state.steps[0] = 4.0, 1
     reward = np.zeros(1, REAL)
-    make_method(config).reward(state, np.zeros(1, np.int8), reward)
+    make_method(config).reward(state, ALL, np.zeros(1, np.int8), reward)
     assert reward[0] == -1
 
 
@@ -247,7 +247,7 @@ def test_the_clock_ends_what_runs(steps, expected, make_state):
     config = WorldConfig(robots=2, groups=1)
     state, out = make_state(config, [(0, 0), (1, 0)], [(40, 0)]), np.zeros(1, np.int8)
     state.steps[0] = steps
-    make_method(config).outcome(state, out)
+    make_method(config).outcome(state, ALL, out)
     assert Outcome(out[0]) is expected
 
 
@@ -259,7 +259,7 @@ def test_the_task_comes_before_the_clock(mate, goal, expected, make_state):
     config = WorldConfig(robots=2, groups=1)
     state, out = make_state(config, [(0, 0), mate], [goal]), np.zeros(1, np.int8)
     state.steps[0] = 500
-    make_method(config).outcome(state, out)
+    make_method(config).outcome(state, ALL, out)
     assert Outcome(out[0]) is expected
 
 

@@ -12,7 +12,7 @@ from sim_core.lanes import LANES
 from sim_core.swarm import step
 from sim_core.swarm import tile as tile_module
 from sim_core.swarm.grid import ROW_SPAN_CELLS
-from sim_core.worlds import WorldBatch
+from sim_core.worlds import Pilot, WorldBatch
 from tests.sim_core.kernels import cell_list, orca_step
 from tests.sim_core.swarm.test_neighbours import brute_force
 
@@ -233,7 +233,7 @@ def record(worlds):
     for i in range(STEPS):
         if i == STEPS // 2:
             worlds.reset(np.arange(NUM_WORLDS) == NUM_WORLDS - 1)
-        found.append(worlds.step(None if i % 3 else np.full(NUM_WORLDS, i % 8))._asdict() | worlds.get_state())
+        found.append(worlds.step(Pilot.FREE if i % 3 else np.full(NUM_WORLDS, i % 8))._asdict() | worlds.get_state())
     return {key: np.stack([one[key] for one in found]) for key in found[0]}
 
 

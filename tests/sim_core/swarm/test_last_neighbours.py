@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_core.config import WorldConfig
-from sim_core.worlds import WorldBatch
+from sim_core.worlds import Pilot, WorldBatch
 from tests.sim_core.kernels import orca_step
 from tests.sim_core.swarm.test_neighbours import brute_force
 
@@ -74,13 +74,13 @@ def test_worlds_that_load_a_state_continue_like_fresh_worlds(robots, groups):
     used.seed(list(range(100, 109)))
     used.reset()
     for _ in range(40):
-        used.step(None)
+        used.step(Pilot.FREE)
     fresh.reset()
     used.set_state(fresh.get_state())
     for step in range(60):
         if step == 30:
             mask = np.arange(9) % 2 == 0
             fresh.reset(mask), used.reset(mask)
-        fresh.step(None), used.step(None)
+        fresh.step(Pilot.FREE), used.step(Pilot.FREE)
         for name, array in fresh.get_state().items():
             np.testing.assert_array_equal(used.get_state()[name], array, err_msg=name)
