@@ -7,7 +7,7 @@ import signal
 
 from rich.console import Console
 
-from deploy.console.summary_tables import evaluation_table, summary_lines
+from deploy.console.summary_tables import evaluation_table, setups_table, summary_lines
 from deploy.console.training_display import make_display
 from deploy.runs.artifacts import log_artifacts
 from learner.checkpoints.checkpoint import Checkpoint
@@ -74,6 +74,8 @@ def run_training(
         console.print(f"resume with: {resume_command(folder)}", highlight=False, soft_wrap=True)
         return 128 + (result.stopped_by or 0)
     console.print(evaluation_table(result.evaluation, config.name))
+    if result.by_setup:
+        console.print(setups_table(result.by_setup))
     for line in summary_lines(folder, result, public_uri(tracker.uri), config.env.is_swarm):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     return 0

@@ -7,9 +7,12 @@ import hashlib
 import json
 import math
 import os
-from dataclasses import dataclass, field
+import re
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
+from actors.evaluation.result_table import GROUPS, ROBOTS
 from actors.rollout.exploration import Exploration
 from actors.rollout.vector_env import EnvSpec
 from sim_core import ENV_ID
@@ -38,6 +41,10 @@ class RunConfig:
     """Device of the learner's networks; `auto` takes CUDA if available, else the CPU."""
     total_env_steps: int = 3_000_000
     """Env steps to train for, over all workers."""
+
+    setups: tuple[str, ...] = ()
+    """Setups that one policy learns at once: `all` of the dissertation's 25, or ROBOTSxGROUPS each, with a share of the
+    environments where they are not equal (10x2 25x8:2); by default that of `robots` and `groups` alone."""
 
     workers: int = 1
     """Rollout workers."""
@@ -135,17 +142,25 @@ class RunConfig:
         check_fields(self)
         _check_ranges(self)
         _check_pairs(self)
+        _check_setups(self)
 
-    @property
+    @cached_property
     def env(self) -> EnvSpec:
         """The environment of rollout workers and evaluators."""
-        return EnvSpec(self.env_id, self.world)
+        return EnvSpec(self.env_id, self.world, tuple(setup_shares(self)))
+
+    @property
+    def title(self) -> str:
+        """What is learned, for users, such as `sensor 10r×2g`, `sensor in 25 setups` or an environment's id."""
+        if not self.env.is_swarm:
+            return self.env_id
+        setups = len(self.env.worlds)
+        return f"{self.world.method_name} {self.world.setup if setups == 1 else f'in {setups} setups'}"
 
     @property
     def name(self) -> str:
         """Name for users, such as `sensor 10r×2g s0`."""
-        what = f"{self.world.method_name} {self.world.setup}" if self.env.is_swarm else self.env_id
-        return f"{what} s{self.seed}"
+        return f"{self.title} s{self.seed}"
 
     @property
     def epsilon_settings(self) -> Exploration:
@@ -239,6 +254,62 @@ def _check_pairs(config: RunConfig) -> None:
     )
 
 
+SETUP = re.compile(r"([1-9][0-9]*)x([1-9][0-9]*)(?::([0-9.]+))?")
+"""A setup on the command line: robots per group, groups, share."""
+
+
+def setup_shares(config: RunConfig) -> list[tuple[WorldConfig, float]]:
+    """The world of each of `setups`, and its share of the environments.
+
+    Raises:
+      ConfigError: a setup is no setup, named twice or impossible.
+    """
+    found: dict[tuple[int, int], float] = {}
+    for text in config.setups:
+        if text == "all":
+            named = {(robots, groups): 1.0 for robots in ROBOTS for groups in GROUPS}
+        else:
+            parts = SETUP.fullmatch(text)
+            require(parts is not None, f"setups must be `all` or ROBOTSxGROUPS, as in 10x2 or 25x8:2, not {text!r}")
+            assert parts is not None
+            share = _share(parts[3] or "1")
+            require(0 < share < math.inf, f"the share of a setup must be greater than 0, not {text!r}")
+            named = {(int(parts[1]), int(parts[2])): share}
+        for setup, share in named.items():
+            require(setup not in found, f"setups name {setup[0]}x{setup[1]} twice; name each once")
+            found[setup] = share
+    return [(replace(config.world, robots=r, groups=g), share) for (r, g), share in found.items()]
+
+
+def _share(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _check_setups(config: RunConfig) -> None:
+    require(
+        isinstance(config.setups, tuple) and all(isinstance(text, str) for text in config.setups),
+        f"setups must be a list of texts such as 10x2, not {config.setups!r}",
+    )
+    if not config.setups:
+        return
+    require(config.env.is_swarm, f"setups are those of our own environment, not of {config.env_id}")
+    worlds = config.env.worlds
+    groups = {world.groups for world in worlds}
+    require(
+        config.world.method_class.fits_any_groups or groups == {config.world.groups},
+        f"setups must all have groups = {config.world.groups}, not {sorted(groups)}: the state of method "
+        f"{config.world.method_name} grows with the groups, and one network takes states of one size",
+    )
+    require(
+        config.envs_per_worker >= len(worlds),
+        f"envs_per_worker ({config.envs_per_worker}) must be at least the number of setups ({len(worlds)}), "
+        "or a rollout worker never plays some of them",
+    )
+
+
 def to_dict(config: RunConfig) -> dict[str, Any]:
     """The config as nested plain values, for JSON and TOML."""
     return dataclasses.asdict(config)
@@ -283,8 +354,9 @@ def from_dict(values: dict[str, Any]) -> RunConfig:
         if unknown:
             raise ConfigError(f"unknown key {unknown[0]!r} in the {where}; `shoal train --help` lists the keys")
     plain = {**values, "world": WorldConfig(**world)}
-    if isinstance(plain.get("hidden_sizes"), list):
-        plain["hidden_sizes"] = tuple(plain["hidden_sizes"])
+    for name in ("hidden_sizes", "setups"):
+        if isinstance(plain.get(name), list):
+            plain[name] = tuple(plain[name])
     return RunConfig(**plain)
 
 

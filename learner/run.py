@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from actors.evaluation.evaluator import evaluate_in_parallel
 from actors.policy.policy import WeightsSnapshot
+from actors.rollout.worker import join_stats, select_stats
 from actors.service.fault_policy import CallFailed, ComponentFailed, FaultTracker, RunFailed, first_line
 from actors.service.messages import EpisodeStats
 from actors.storage.uri import Location
@@ -33,7 +34,7 @@ from learner.tracking.mlflow_run import MLFLOW_ERRORS, Tracker
 from learner.tracking.observer import Display, MirroringObserver
 from learner.tracking.redaction import hide_secrets
 from learner.training.cluster import Cluster, ProcessCluster
-from learner.training.evaluation_summary import Evaluation, as_metrics, summarise
+from learner.training.evaluation_summary import Evaluation, as_metrics, score, summarise
 from learner.training.recovery import RunLost
 from learner.training.stop_signals import stop_on_signals
 
@@ -49,7 +50,8 @@ class RunResult(NamedTuple):
 
     `checkpoint` is the location of the session's last checkpoint, None if it could not be written. `stopped_by` is the
     number of the signal that stopped the run before its end, else None. `evaluation` summarises the final greedy
-    `episodes`, played with `weights`; all three are None if the run was stopped.
+    `episodes`, played with `weights`; all three are None if the run was stopped. `by_setup` summarises them by setup
+    where there are several.
     """
 
     env_steps: int
@@ -59,6 +61,7 @@ class RunResult(NamedTuple):
     evaluation: Evaluation | None
     episodes: EpisodeStats | None
     weights: WeightsSnapshot | None
+    by_setup: dict[str, Evaluation]
 
 
 class RunSession:
@@ -162,13 +165,15 @@ class RunSession:
                     _restore(loop, checkpoint)
                 observer.ready()
                 if not loop.run():
-                    return RunResult(loop.env_steps, loop.updates, loop.saved, stop.signal, None, None, None)
+                    return RunResult(loop.env_steps, loop.updates, loop.saved, stop.signal, None, None, None, {})
                 self._display.message(f"training done; evaluating {self._config.final_eval_episodes} greedy episodes")
                 weights = loop.newest_weights()
                 episodes = final_evaluation(self._config, cluster, weights)
             except ComponentFailed as failure:  # before or after the rounds of training
                 raise loop.lost(failure) from failure
-            return RunResult(loop.env_steps, loop.updates, loop.saved, None, summarise(episodes), episodes, weights)
+            by_setup = evaluation_by_setup(self._config, episodes)
+            evaluation = summarise(episodes)
+            return RunResult(loop.env_steps, loop.updates, loop.saved, None, evaluation, episodes, weights, by_setup)
 
     @cached_property
     def _monitor(self) -> Callable[[Row], None]:
@@ -195,6 +200,8 @@ class RunSession:
         """Logs the results and the artifacts of a finished run, and retries while MLflow fails."""
         tracker, timeout_s = self._tracker, self._tracker.retry_timeout_s
         metrics, time_ms = as_metrics(evaluation), self._time_of_results(result, rows)
+        if result.by_setup:
+            metrics["worst_setup"] = min(map(score, result.by_setup.values()))
         retry(lambda: tracker.log_results(metrics, time_ms), "the results", timeout_s, self._say)
         retry(lambda: finish(result, rows), "the artifacts", timeout_s, self._say)
 
@@ -210,6 +217,15 @@ class RunSession:
             retry(lambda: self._tracker.end(status), f"that the run is {status}", timeout_s, self._say)
         except MLFLOW_ERRORS as error:
             self._say(f"MLflow does not know that the run is {status}: {first_line(error)}")
+
+
+def evaluation_by_setup(config: RunConfig, episodes: EpisodeStats) -> dict[str, Evaluation]:
+    """Summaries of the final evaluation by setup, such as `10r×2g`; empty where there is only one."""
+    setups, size = config.env.worlds, config.final_eval_episodes
+    if len(setups) == 1:
+        return {}
+    chunks = [select_stats(episodes, slice(i * size, (i + 1) * size)) for i in range(len(setups))]
+    return {world.setup: summarise(chunk) for world, chunk in zip(setups, chunks, strict=True)}
 
 
 def open_cluster(config: RunConfig, incarnation: int, options: ClusterOptions) -> Cluster:
@@ -255,13 +271,19 @@ def _restore(loop: TrainingLoop, checkpoint: Checkpoint) -> None:
 def final_evaluation(config: RunConfig, cluster: Cluster, weights: WeightsSnapshot) -> EpisodeStats:
     """Plays `final_eval_episodes` greedy episodes with `weights`, in parallel tasks that need no component of the run.
 
+    Returns:
+      One entry per episode; of several setups, that many of each, one setup after the other.
+
     Raises:
       RunFailed: a task fails again and again.
     """
     first = config.final_eval_first_seed
     seeds = list(range(first, first + config.final_eval_episodes))
     shared = cluster.calls.put(weights)
+    specs = [config.env.of_setup(world) for world in config.env.worlds]
     try:
-        return evaluate_in_parallel(cluster.calls, config.env, shared, seeds, cluster.limits.eval_tasks)
+        return join_stats(
+            [evaluate_in_parallel(cluster.calls, spec, shared, seeds, cluster.limits.eval_tasks) for spec in specs]
+        )
     except CallFailed as failure:
         raise RunFailed(f"the evaluation at the end {failure.fault} again and again: {failure.reason}") from failure

@@ -205,6 +205,14 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
             observation = self.worlds.reset(done)
         return observation, result.reward.astype(np.float64), terminated, done & ~terminated, infos
 
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """Copies of all arrays that a checkpoint needs, by name."""
+        return self.worlds.get_state()
+
+    def set_state(self, saved: dict[str, NDArray[Any]]) -> NDArray[Any]:
+        """Takes up saved arrays; returns the observations there (see `WorldBatch.set_state` for errors)."""
+        return self.worlds.set_state(saved)
+
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One image `[height, width, 3]` uint8 a world in mode `rgb_array`, else None."""
         if self.render_mode != "rgb_array":

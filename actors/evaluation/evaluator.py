@@ -17,7 +17,7 @@ from actors.evaluation.trajectory import NO_ACTION, Episode
 from actors.policy.baselines import ActionRule, Baseline, make_baseline
 from actors.policy.policy import Policy, WeightsSnapshot
 from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
-from actors.rollout.worker import join_stats
+from actors.rollout.worker import join_stats, select_stats
 from actors.service.fault_policy import Action, CallFailed, ComponentKind, decide
 from actors.service.messages import NO_OUTCOME, EpisodeStats
 from actors.service.rpc import Calls, Ref, by_reference
@@ -61,7 +61,7 @@ def make_action_rule(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> A
 
 
 def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> EpisodeStats:
-    """Plays one episode per seed.
+    """Plays one episode per seed; of n setups, in that of index seed modulo n.
 
     Returns:
       One entry per seed, in order.
@@ -69,8 +69,18 @@ def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> EpisodeSt
     Raises:
       ConfigError: see `make_action_rule`.
     """
+    if spec.shares:
+        return _evaluate_in_turn(spec, candidate, np.array(seeds, np.int64))
     chunks = [seeds[i : i + MAX_ENVS] for i in range(0, len(seeds), MAX_ENVS)]
     return join_stats([_play(spec, make_action_rule(spec, candidate, chunk), chunk) for chunk in chunks])
+
+
+def _evaluate_in_turn(spec: EnvSpec, candidate: Candidate, seeds: NDArray[np.int64]) -> EpisodeStats:
+    worlds = spec.worlds
+    order = np.argsort(seeds % len(worlds), kind="stable")
+    parts = [seeds[seeds % len(worlds) == i].tolist() for i in range(len(worlds))]
+    played = [evaluate(spec.of_setup(world), candidate, part) for world, part in zip(worlds, parts, strict=True)]
+    return select_stats(join_stats(played), np.argsort(order))
 
 
 def evaluate_in_parallel(

@@ -10,17 +10,32 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from actors.rollout.joined_env import JoinedVectorEnv
 from sim_core import ENV_ID
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
+from sim_core.envs import SwarmVectorEnv
 from sim_core.worlds import rehearse
 
 
 class EnvSpec(NamedTuple):
-    """Specification of an environment: its Gymnasium id, and the world's settings if it is the swarm environment."""
+    """Specification of an environment: its Gymnasium id, and the world's settings if it is the swarm environment.
+
+    `shares` are the worlds of several setups with their shares of the environments; empty where `world` is alone.
+    """
 
     env_id: str
     world: WorldConfig
+    shares: tuple[tuple[WorldConfig, float], ...] = ()
+
+    @property
+    def worlds(self) -> list[WorldConfig]:
+        """The worlds of all setups."""
+        return [world for world, _ in self.shares] or [self.world]
+
+    def of_setup(self, world: WorldConfig) -> EnvSpec:
+        """The environment of one setup alone."""
+        return EnvSpec(self.env_id, world)
 
     @property
     def is_swarm(self) -> bool:
@@ -40,6 +55,13 @@ def make_vector_env(spec: EnvSpec, num_envs: int) -> gym.vector.VectorEnv[Any, A
       ConfigError: the id is unknown, its observations are no Box, or its actions are no Discrete that starts at 0.
     """
     try:
+        if spec.shares:
+            return JoinedVectorEnv(
+                [
+                    SwarmVectorEnv(count, **dataclasses.asdict(world))
+                    for (world, _), count in zip(spec.shares, _counts(spec, num_envs), strict=True)
+                ]
+            )
         if spec.is_swarm:
             env = gym.make_vec(ENV_ID, num_envs=num_envs, **spec.settings)
         else:
@@ -49,6 +71,16 @@ def make_vector_env(spec: EnvSpec, num_envs: int) -> gym.vector.VectorEnv[Any, A
         raise ConfigError(f"env_id {spec.env_id!r} cannot be made by Gymnasium: {error}") from error
     _check_spaces(env, spec.env_id)
     return env
+
+
+def _counts(spec: EnvSpec, num_envs: int) -> list[int]:
+    """Environments of every setup: at least one each, the rest in proportion to the shares (largest remainder)."""
+    shares = np.array([share for _, share in spec.shares])
+    quotas = shares / shares.sum() * (num_envs - len(shares))
+    counts = np.floor(quotas).astype(int)
+    most_left = np.argsort(counts - quotas, kind="stable")[: num_envs - len(shares) - counts.sum()]
+    counts[most_left] += 1
+    return [int(count) + 1 for count in counts]
 
 
 def reset_seeded(env: gym.vector.VectorEnv[Any, Any, Any], seeds: list[int]) -> NDArray[Any]:
@@ -90,9 +122,9 @@ def env_shape(spec: EnvSpec) -> EnvShape:
     Raises:
       ConfigError: see `make_vector_env`; also if the rehearsal finds an error in the user's code.
     """
-    if spec.is_swarm:
-        rehearse(spec.world)
-    env = make_vector_env(spec, 1)
+    for world in spec.worlds if spec.is_swarm else []:
+        rehearse(world)
+    env = make_vector_env(spec, len(spec.worlds))
     try:
         return spaces_of(env)
     finally:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from actors.policy.policy import Policy, WeightsSnapshot
 from actors.rollout.exploration import draw_random_actions, explore
+from actors.rollout.joined_env import JoinedVectorEnv
 from actors.rollout.nstep import NStepAssembler, Steps, empty_steps
 from actors.rollout.vector_env import EnvSpec, final_observations, make_vector_env, reset_seeded, spaces_of
 from actors.service.messages import (
@@ -102,7 +103,7 @@ class RolloutWorker:
             made=self._made,
         )
         self._sequence += 1
-        return TransitionBlock(header, packed, _select(ended, steps.done))
+        return TransitionBlock(header, packed, select_stats(ended, steps.done))
 
     def _step(
         self, policy: Policy, random_actions: NDArray[np.int64], steps: Steps, ended: EpisodeStats, i: int
@@ -132,8 +133,8 @@ class RolloutWorker:
         """
         arrays = {f"nstep_{name}": array for name, array in self._nstep.get_state().items()}
         arrays |= {"length": self._length.copy(), "return": self._return.copy()}
-        if isinstance(self._env, SwarmVectorEnv):
-            arrays |= {f"world_{name}": array for name, array in self._env.worlds.get_state().items()}
+        if isinstance(self._env, SwarmVectorEnv | JoinedVectorEnv):
+            arrays |= {f"world_{name}": array for name, array in self._env.get_state().items()}
         meta = {"sequence": self._sequence, "rng": self._rng.bit_generator.state, "policy": None}
         if self._policy is not None:
             version, time_s, layers = self._policy.weights
@@ -150,10 +151,10 @@ class RolloutWorker:
             version, time_s = meta["policy"]
             layers = tuple(arrays[f"policy_{i}"] for i in range(count))
             self.set_weights(WeightsSnapshot(version, time_s, layers))
-        if not isinstance(self._env, SwarmVectorEnv):
+        if not isinstance(self._env, SwarmVectorEnv | JoinedVectorEnv):
             return
         worlds = {name.removeprefix("world_"): array for name, array in arrays.items() if name.startswith("world_")}
-        self._observation = self._env.worlds.set_state(worlds)
+        self._observation = self._env.set_state(worlds)
         nstep = {name.removeprefix("nstep_"): array for name, array in arrays.items() if name.startswith("nstep_")}
         self._nstep.set_state(nstep)
         self._length[:], self._return[:] = arrays["length"], arrays["return"]
@@ -167,6 +168,7 @@ def join_stats(stats: list[EpisodeStats]) -> EpisodeStats:
     return EpisodeStats(*(np.concatenate(column) for column in columns))
 
 
-def _select(stats: EpisodeStats, mask: NDArray[np.bool_]) -> EpisodeStats:
+def select_stats(stats: EpisodeStats, rows: NDArray[Any] | slice) -> EpisodeStats:
+    """The episodes of `rows`: a mask, indices or a slice."""
     outcome, length_steps, episode_return = stats
-    return EpisodeStats(outcome[mask], length_steps[mask], episode_return[mask])
+    return EpisodeStats(outcome[rows], length_steps[rows], episode_return[rows])

@@ -14,7 +14,8 @@ from actors.evaluation.evaluator import Candidate, record_episode
 from actors.evaluation.trajectory import save_episodes
 from actors.policy.baselines import Baseline
 from actors.rollout.vector_env import EnvSpec
-from deploy.console.summary_tables import evaluation_table
+from actors.rollout.worker import join_stats
+from deploy.console.summary_tables import evaluation_table, setups_table
 from deploy.options.results import Evaluate
 from deploy.options.training import ray_address
 from deploy.runs.folders import make_folder
@@ -48,7 +49,12 @@ def run(command: Evaluate) -> int:
     if command.out is not None:
         _check_outputs(command.out, command.record, target.spec)
     seeds = list(range(command.first_seed, command.first_seed + command.episodes))
-    stats = evaluate_in_tasks(target.spec, target.candidate, seeds, ray_address(command.address))
+    specs = [target.spec.of_setup(world) for world in target.spec.worlds]
+    played = evaluate_in_tasks(specs, target.candidate, seeds, ray_address(command.address))
+    stats = join_stats(played)
+    if len(specs) > 1:
+        setups = (spec.world.setup for spec in specs)
+        Console().print(setups_table(dict(zip(setups, map(summarise, played), strict=True))))
     kind = "episodes" if isinstance(target.candidate, Baseline) else "greedy episodes"
     Console().print(evaluation_table(summarise(stats), target.title, kind))
     if command.out is not None:
@@ -80,10 +86,15 @@ def _trained(command: Evaluate) -> Target:
         config.env.is_swarm or (command.robots is None and command.groups is None),
         f"--robots and --groups apply to our own environment, not to {config.env_id}",
     )
-    config = dataclasses.replace(config, world=_resized(config.world, command))
+    if command.robots is not None or command.groups is not None:
+        config = dataclasses.replace(config, world=_resized(config.world, command), setups=())
+    require(
+        command.out is None or not config.setups,
+        f"--out stores the episodes of one setup, and {command.run!r} has learned {len(config.env.worlds)}: name one "
+        "with --robots and --groups",
+    )
     weights = find_policy(folder, config, command.checkpoint)
-    title = f"{config.world.method_name} {config.world.setup}" if config.env.is_swarm else config.env_id
-    return Target(config.env, weights, folder.path.name, weights.version, title)
+    return Target(config.env, weights, folder.path.name, weights.version, config.title)
 
 
 def _resized(world: WorldConfig, command: Evaluate) -> WorldConfig:

@@ -10,6 +10,7 @@ from actors.evaluation.statistics import Estimate
 from learner.run import RunResult
 from learner.run_folder import RunFolder
 from learner.training.evaluation_summary import Evaluation, outcome_label
+from sim_core.outcomes import Outcome
 
 
 def evaluation_table(evaluation: Evaluation, title: str, kind: str = "greedy episodes") -> Table:
@@ -21,7 +22,17 @@ def evaluation_table(evaluation: Evaluation, title: str, kind: str = "greedy epi
     for outcome, estimate in evaluation.rates.items():
         table.add_row(outcome_label(outcome).replace("_", " "), *_percent(estimate))
     table.add_row("mean return", *_plain(evaluation.episode_return, 2))
-    table.add_row("mean episode length (env steps)", *_plain(evaluation.episode_length, 1))
+    table.add_row("mean episode length (steps)", *_plain(evaluation.episode_length, 1))
+    return table
+
+
+def setups_table(by_setup: dict[str, Evaluation]) -> Table:
+    """The success rate in every setup, with 95 % intervals."""
+    table = Table(title="success rate by setup", title_justify="left")
+    for name in ("setup", "success rate", "95 % interval"):
+        table.add_column(name, justify="left" if name == "setup" else "right")
+    for setup, evaluation in by_setup.items():
+        table.add_row(setup, *_percent(evaluation.rates[Outcome.GOAL]))
     return table
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from actors.evaluation.evaluator import record_episode, record_frames
 from actors.evaluation.trajectory import Episode, load_episodes, save_episodes
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import env_shape
+from actors.storage.atomic_write import replacing_file
 from dashboards.figures.learning_curve import learning_curve_png
 from dashboards.figures.video import check_video_packages, episode_frames, write_mp4
 from dashboards.pages.player import player_html
@@ -50,9 +52,22 @@ def log_artifacts(
             written += foreign_animation(config, result.weights, config.final_eval_first_seed, path)
         except ConfigError as error:
             message(f"no animation: {error}")
+    if result.by_setup:
+        written.append(_setups(folder, result))
     for path in written:
         tracker.log_artifact(path)
     tracker.log_policy(result.weights, config, env_shape(config.env), score(result.evaluation))
+
+
+def _setups(folder: RunFolder, result: RunResult) -> Path:
+    """Writes the rates of every setup as `setups.csv`."""
+    path = folder.artifacts / "setups.csv"
+    rows = [{"setup": setup} | as_metrics(evaluation) for setup, evaluation in result.by_setup.items()]
+    with replacing_file(path) as partial, open(partial, "w", newline="") as file:
+        table = csv.DictWriter(file, list(rows[0]))
+        table.writeheader()
+        table.writerows(rows)
+    return path
 
 
 def _last_row(result: RunResult) -> Row:
@@ -66,8 +81,7 @@ def _curve(folder: RunFolder, config: RunConfig, rows: list[Row]) -> Path:
     path = folder.artifacts / "learning_curve.png"
     points = curve_points(rows)
     is_share = points[0].failures is not None
-    title = f"{config.world.method_name} {config.world.setup}" if config.env.is_swarm else config.env_id
-    learning_curve_png(points, path, title, "success rate" if is_share else "mean return", is_share)
+    learning_curve_png(points, path, config.title, "success rate" if is_share else "mean return", is_share)
     return path
 
 

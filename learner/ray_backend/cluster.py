@@ -149,16 +149,19 @@ def leave() -> None:
             process.kill()
 
 
-def evaluate_in_tasks(spec: EnvSpec, candidate: Candidate, seeds: list[int], address: str | None) -> EpisodeStats:
-    """Plays one episode per seed in Ray tasks on all CPUs (see `connect` for errors).
+def evaluate_in_tasks(
+    specs: list[EnvSpec], candidate: Candidate, seeds: list[int], address: str | None
+) -> list[EpisodeStats]:
+    """Plays one episode per environment and seed in Ray tasks on all CPUs (see `connect` for errors).
 
     Returns:
-      One entry per seed, in order.
+      For each environment one entry per seed, in order.
     """
     connect(1, address)
     calls = RayCalls(DEADLINE_S)
     try:
-        return evaluate_in_parallel(calls, spec, calls.put(candidate), seeds, cluster_cpus())
+        who, cpus = calls.put(candidate), cluster_cpus()
+        return [evaluate_in_parallel(calls, spec, who, seeds, cpus) for spec in specs]
     finally:
         leave()
 

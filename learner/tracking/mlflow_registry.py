@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import json
 import re
+from typing import Any
 
 from mlflow import MlflowClient
 from mlflow.entities import Dataset, DatasetInput, InputTag
@@ -30,6 +31,8 @@ SCORE = "score"
 def model_name(config: RunConfig) -> str:
     """Name of the registered model for a run's setup; MLflow refuses `/` and `:`, which Gymnasium's ids may have."""
     world = config.world
+    if len(config.env.worlds) > 1:
+        return f"{world.method_name}-{len(config.env.worlds)}-setups"
     if config.env.is_swarm:
         return f"{world.method_name}-{world.robots}r-{world.groups}g"
     return re.sub(r"[/:]", "-", config.env_id)
@@ -81,7 +84,9 @@ def dataset_inputs(config: RunConfig, commit: str) -> list[DatasetInput]:
 
 
 def _dataset(config: RunConfig, commit: str, context: str, profile: dict[str, int]) -> DatasetInput:
-    plays = dataclasses.asdict(config.world) if config.env.is_swarm else {"env_id": config.env_id}
+    plays: dict[str, Any] = dataclasses.asdict(config.world) if config.env.is_swarm else {"env_id": config.env_id}
+    if config.setups:
+        plays["setups"] = config.setups
     digest = hashlib.sha256(json.dumps(plays | profile, sort_keys=True).encode()).hexdigest()[:8]
     source = json.dumps({"tags": {"mlflow.source.git.commit": commit}})
     dataset = Dataset(model_name(config), digest, "code", source, profile=json.dumps(profile))

@@ -124,8 +124,8 @@ class Tracker:
         """
         config_tags = {
             "method": config.world.method_name if config.env.is_swarm else "none",
-            "robots": str(config.world.robots),
-            "groups": str(config.world.groups),
+            "robots": _only({world.robots for world in config.env.worlds}),
+            "groups": _only({world.groups for world in config.env.worlds}),
             "seed": str(config.seed),
             "engine": config.engine,
             "config_hash": config_hash(config),
@@ -258,6 +258,11 @@ class Tracker:
     def end(self, status: str) -> None:
         """Ends the run with the status FINISHED, KILLED or FAILED."""
         self._client.set_terminated(self.run_id, status)
+
+
+def _only(values: set[int]) -> str:
+    """The value that all setups have, as a tag; `several` if they differ."""
+    return str(next(iter(values))) if len(values) == 1 else "several"
 
 
 def _param_text(name: str, value: object) -> str:

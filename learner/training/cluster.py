@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from actors.replay.prioritised import PrioritySettings
 from actors.rollout.node import PushTarget, RolloutNode
 from actors.rollout.vector_env import EnvShape, env_shape
 from actors.rollout.worker import RolloutSettings
+from actors.service.fault_policy import ComponentFailed
 from actors.service.messages import transition_dtype
 from actors.service.rpc import Calls, Handle, LocalCalls, Ref, local_handle
 from learner.checkpoints.writer import Checkpointable
@@ -177,7 +179,8 @@ class ProcessCluster(Cluster):
         """Waits until no node writes any more."""
         nodes: list[Handle[Checkpointable]] = [self.learner, *self.workers]
         for node in nodes:
-            LocalCalls().start(node, Checkpointable.saved, LAST_WRITE_S)
+            with suppress(ComponentFailed):  # what ended the attempt is the error to show
+                LocalCalls().start(node, Checkpointable.saved, LAST_WRITE_S)
 
     def close(self) -> None:
         """Does nothing."""

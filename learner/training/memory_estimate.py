@@ -34,7 +34,7 @@ def bytes_by_setting(config: RunConfig, shape: EnvShape) -> dict[str, int]:
     priority = PRIORITY_BYTES if config.replay == "prioritised" else 0
     widths = [shape.observation_size, *config.policy_sizes, shape.num_actions]
     weights = sum(inputs * outputs + outputs for inputs, outputs in itertools.pairwise(widths))
-    robots = config.world.num_robots if config.env.is_swarm else 1
+    robots = max(world.num_robots for world in config.env.worlds) if config.env.is_swarm else 1
     actors = config.workers + (config.replay_shards if config.replay_placement == "actors" else 0)
     return {
         "workers, envs_per_worker and robots": config.workers * config.envs_per_worker * robots * ROBOT_BYTES,

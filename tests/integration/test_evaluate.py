@@ -32,7 +32,9 @@ FIRST_SEED = 2_000_000_000
 def folder(tmp_path, monkeypatch):
     """An empty folder to work in, where evaluation needs no Ray."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(playing, "evaluate_in_tasks", lambda spec, player, seeds, _: evaluate(spec, player, seeds))
+    monkeypatch.setattr(
+        playing, "evaluate_in_tasks", lambda specs, who, seeds, _: [evaluate(s, who, seeds) for s in specs]
+    )
     return tmp_path
 
 

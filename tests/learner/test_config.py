@@ -70,11 +70,33 @@ def test_values_out_of_range_are_refused(name, values):
         ({"replay_capacity": 32_767, "min_replay": 100, "replay_shards": 4}, "in each of 4"),
         ({"replay_capacity": 20_000, "min_replay": 20_001}, "min_replay.*must not exceed"),
         ({"total_env_steps": 20_000, "min_replay": 20_000}, "nothing is learned"),
+        ({"policy_average_updates": -1}, "policy_average_updates must not be negative, not -1"),
+        ({"setups": ("10r2g",)}, "ROBOTSxGROUPS, as in 10x2 or 25x8:2, not '10r2g'"),
+        ({"setups": ("10x2:0",)}, "share of a setup must be greater than 0, not '10x2:0'"),
+        ({"setups": ("10x2:1.2.3",)}, "share of a setup must be greater than 0, not '10x2:1.2.3'"),
+        ({"setups": ("10x2", "10x2:3")}, "setups name 10x2 twice"),
+        ({"setups": ("all", "25x8")}, "setups name 25x8 twice"),
+        ({"setups": ("1x2",)}, "robots must be at least 2"),
+        ({"setups": ("10x2",), "env_id": "CartPole-v1"}, "setups are those of our own environment, not of CartPole"),
+        ({"setups": ("all",), "envs_per_worker": 24}, r"envs_per_worker \(24\) must be at least .* setups \(25\)"),
+        ({"setups": ("5x2", "5x4"), "world": WorldConfig(method="in")}, r"have groups = 2, not \[2, 4\]: .* method in"),
+        ({"setups": "all"}, "setups must be a list of texts such as 10x2, not 'all'"),
     ],
 )
 def test_values_that_contradict_each_other_are_refused(settings, words):
     with pytest.raises(ConfigError, match=words):
         RunConfig(**settings)
+
+
+def test_all_setups_are_those_of_the_dissertation():
+    spec = RunConfig(setups=("all",)).env
+    assert [(world.robots, world.groups) for world in spec.worlds] == [
+        (robots, groups) for robots in (5, 10, 15, 20, 25) for groups in (1, 2, 3, 4, 8)
+    ]
+    weighted = RunConfig(setups=("7x3", "25x8:2.5")).env
+    assert [(world.setup, share) for world, share in weighted.shares] == [("7r×3g", 1.0), ("25r×8g", 2.5)]
+    assert RunConfig().env.worlds == [RunConfig().world]
+    assert RunConfig(setups=("all",)).name == "sensor in 25 setups s0"
 
 
 def test_limits_themselves_are_accepted():
@@ -167,6 +189,7 @@ def changed(config, name):
         "env_id": "CartPole-v1",
         "world": dataclasses.replace(config.world, reward_scale=2.0),
         "hidden_sizes": (*config.hidden_sizes, 4),
+        "setups": ("4x2", "5x1"),
     }
     if name not in others:
         others[name] = value + 1 if isinstance(value, int) else value / 2

@@ -63,6 +63,20 @@ def test_entries_are_in_the_order_of_the_seeds(swarm, make_weights):
     assert [len(column) for column in evaluate(swarm, weights, [])] == [0, 0, 0]
 
 
+def test_of_several_setups_each_seed_plays_in_the_next(swarm, make_weights):
+    worlds = [dataclasses.replace(swarm.world, robots=robots) for robots in (3, 4, 5)]
+    weights = make_weights(swarm)
+    spec = swarm._replace(shares=tuple((world, 1.0) for world in worlds))
+    seeds = [11, 3, 4, 5, 20, 2, 8]
+    stats = evaluate(spec, weights, seeds)
+    for i, seed in enumerate(seeds):
+        alone = evaluate(spec.of_setup(worlds[seed % 3]), weights, [seed])
+        assert [column[i] for column in stats] == [column[0] for column in alone]
+    calls = LocalCalls()
+    for joined, whole in zip(evaluate_in_parallel(calls, spec, calls.put(weights), seeds, 3), stats, strict=True):
+        np.testing.assert_array_equal(joined, whole)
+
+
 def with_rule(spec, baseline):
     """The environment, with a method that has the baseline."""
     return spec._replace(world=dataclasses.replace(spec.world, method="in")) if baseline == "field" else spec

@@ -1,0 +1,97 @@
+"""Swarm environments of several setups as one vector environment, so that one policy acts in all of them."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from sim_core.envs import SwarmVectorEnv
+
+Arrays = dict[str, NDArray[Any]]
+
+
+class JoinedVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArray[Any]]):
+    """Vector environments with equal spaces, one after the other; each restarts its worlds in the same step.
+
+    Args:
+      parts: the environments.
+    """
+
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(self, parts: list[SwarmVectorEnv]) -> None:
+        self._parts = parts
+        self._ends = np.cumsum([part.num_envs for part in parts])[:-1]
+        self.num_envs = sum(part.num_envs for part in parts)
+        self.single_observation_space = parts[0].single_observation_space
+        self.single_action_space = parts[0].single_action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Starts an episode in every world; world i takes `seed[i]`."""
+        seeds = [None] * len(self._parts) if not isinstance(seed, list) else np.split(np.array(seed), self._ends)
+        given = [None if part is None else cast("list[int | None]", part.tolist()) for part in seeds]
+        parts = zip(self._parts, given, strict=True)
+        return np.concatenate([part.reset(seed=own)[0] for part, own in parts]), {}
+
+    def step(
+        self, actions: NDArray[np.int64]
+    ) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """One env step of every world; `actions` `[num_envs]`.
+
+        Raises:
+          ValueError: an action is none of the action space.
+        """
+        chunks = np.split(np.asarray(actions), self._ends)
+        steps = [part.step(chunk) for part, chunk in zip(self._parts, chunks, strict=True)]
+        *columns, infos = zip(*steps, strict=True)
+        observation, reward, terminated, truncated = (np.concatenate(column) for column in columns)
+        return observation, reward, terminated, truncated, self._joined_infos(steps, infos)
+
+    def _joined_infos(self, steps: list[Any], infos: tuple[dict[str, Any], ...]) -> dict[str, Any]:
+        """What the parts tell of ended episodes; a part without any adds rows that its masks leave out."""
+        if not any(infos):
+            return {}
+        names = next(info for info in infos if info)["final_info"]
+        final: Arrays = {}
+        for name in names:
+            dtype = next(info for info in infos if info)["final_info"][name].dtype
+            final[name] = np.concatenate(
+                [
+                    info["final_info"][name] if info else np.zeros(part.num_envs, dtype)
+                    for part, info in zip(self._parts, infos, strict=True)
+                ]
+            )
+        ended = final["_outcome"]
+        observations = [info["final_obs"] if info else step[0] for step, info in zip(steps, infos, strict=True)]
+        return {
+            "final_obs": np.concatenate(observations),
+            "_final_obs": ended,
+            "final_info": final,
+            "_final_info": ended,
+        }
+
+    def get_state(self) -> Arrays:
+        """Copies of all arrays that a checkpoint needs, by part and name."""
+        states = [part.get_state() for part in self._parts]
+        return {f"{i}.{name}": array for i, state in enumerate(states) for name, array in state.items()}
+
+    def set_state(self, saved: Arrays) -> NDArray[Any]:
+        """Takes up saved arrays; returns the observations there.
+
+        Raises:
+          ValueError: an array is missing or has another shape or dtype.
+        """
+        seen = []
+        for i, part in enumerate(self._parts):
+            own = {name.removeprefix(f"{i}."): array for name, array in saved.items() if name.startswith(f"{i}.")}
+            seen.append(part.set_state(own))
+        return np.concatenate(seen)
