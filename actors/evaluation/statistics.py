@@ -100,6 +100,35 @@ def ratio(samples: Sequence[Sequence[tuple[int, int]]]) -> Estimate:
     return Estimate(binomial.value, low, high)
 
 
+class PairedComparison(NamedTuple):
+    """Two players on the same start scenes: the difference of their success rates, and the sign test's p-value."""
+
+    difference: Estimate
+    won: int
+    lost: int
+    p_value: float
+
+
+def paired_comparison(first: np.ndarray, second: np.ndarray) -> PairedComparison:
+    """Compares the successes `[count]` bool of two players in the same episodes.
+
+    The interval of the difference of the rates, second less first, is that of Bonett and Price (2012, "Adjusted Wald
+    confidence interval for a difference of binomial proportions based on paired data"). The sign test is the exact
+    binomial test of the episodes that one of the two alone won (McNemar 1947).
+
+    Raises:
+      ValueError: the numbers of episodes differ, or there are none.
+    """
+    if len(first) != len(second) or len(first) == 0:
+        raise ValueError(f"paired results need equally many episodes, not {len(first)} and {len(second)}")
+    total, won, lost = len(first), int((second & ~first).sum()), int((first & ~second).sum())
+    up, down = (won + 1) / (total + 2), (lost + 1) / (total + 2)
+    half = Z * math.sqrt((up + down - (up - down) ** 2) / (total + 2))
+    low, high = max(-1.0, up - down - half), min(1.0, up - down + half)
+    p_value = float(scipy_stats.binomtest(won, won + lost).pvalue) if won + lost else 1.0
+    return PairedComparison(Estimate((won - lost) / total, low, high), won, lost, p_value)
+
+
 def mean(values: np.ndarray) -> Estimate:
     """Mean of `values` `[count]` with its Student t interval, which has width 0 for a single value."""
     centre = float(np.mean(values))

@@ -45,6 +45,12 @@ def exists(baseline: Baseline, config: WorldConfig) -> bool:
     return baseline not in METHOD_RULES or baseline in config.method_class.rules(config)
 
 
+def check_exists(baseline: Baseline, config: WorldConfig) -> None:
+    """Raises ConfigError if the world's method lacks this baseline."""
+    others = ", ".join(other for other in Baseline if exists(other, config))
+    require(exists(baseline, config), f"method {config.method_name} has no rule {baseline}; play one of: {others}")
+
+
 class FlOrcaRule:
     """FL-ORCA itself, free or snapped to the actions.
 
@@ -72,8 +78,7 @@ class MethodRule:
     """
 
     def __init__(self, config: WorldConfig, baseline: Baseline) -> None:
-        others = ", ".join(other for other in Baseline if exists(other, config))
-        require(exists(baseline, config), f"method {config.method_name} has no rule {baseline}; play one of: {others}")
+        check_exists(baseline, config)
         self._rule = config.method_class.rules(config)[baseline]
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.int64]:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import shlex
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
 
-from actors.evaluation.statistics import Estimate
+from actors.evaluation.statistics import Estimate, paired_comparison, rate
 from learner.run import RunResult
 from learner.run_folder import RunFolder
 from learner.training.evaluation_summary import Evaluation, outcome_label
@@ -34,6 +36,26 @@ def setups_table(by_setup: dict[str, Evaluation]) -> Table:
     for setup, evaluation in by_setup.items():
         table.add_row(setup, *_percent(evaluation.rates[Outcome.GOAL]))
     return table
+
+
+def compared(setup: str, name: str, goals: list[NDArray[np.bool_]]) -> tuple[str, ...]:
+    """A player's row of a comparison.
+
+    Args:
+      setup: name of the setup.
+      name: the player's.
+      goals: successes `[episodes]` of the players so far, the first one's first and this one's last.
+
+    Returns:
+      Setup, name, success rate with interval; difference to the first with interval, and the sign test.
+    """
+    played = (setup, name, *_percent(rate(int(goals[-1].sum()), len(goals[-1]))))
+    if len(goals) == 1:
+        return (*played, "", "", "")
+    paired = paired_comparison(goals[0], goals[-1])
+    value, low, high = (100 * number for number in paired.difference)
+    sign = f"{paired.won} : {paired.lost}, p = {paired.p_value:.2g}"
+    return (*played, f"{value:+.1f}", f"{low:+.1f} … {high:+.1f}", sign)
 
 
 def _percent(estimate: Estimate) -> tuple[str, str]:

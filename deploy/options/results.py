@@ -30,10 +30,13 @@ class Report:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Play a run's greedy policy, or a baseline, on fixed seeds; print its rates with 95 % intervals."""
+    """Play greedy policies of runs, or baselines, on fixed seeds; print rates with 95 % intervals.
 
-    run: Positional[str]
-    """Name of the run, or its folder; or fl-orca, fl-orca-snapped, greedy, field or random (a run so named: ./NAME)."""
+    Several players meet the same start scenes; their differences to the first are paired.
+    """
+
+    run: Positional[tuple[str, ...]]
+    """Names of runs, or their folders; or fl-orca, fl-orca-snapped, greedy, field, random (a run so named: ./NAME)."""
     episodes: int = 1_000
     """Episodes to play."""
     first_seed: int = 2_000_000_000
@@ -58,6 +61,9 @@ class Evaluate:
     """Ray cluster to join; RAY_ADDRESS by default, else a Ray on this machine."""
 
     def __post_init__(self) -> None:
+        require(len(self.run) > 0, "name a run, or a baseline, as in `shoal evaluate greedy`")
+        require(len(set(self.run)) == len(self.run), f"name each player once, not {' '.join(self.run)}")
+        require(len(self.run) == 1 or self.out is None, "--out stores the results of one player; evaluate it alone")
         require(1 <= self.episodes <= 10**7, f"--episodes must be in 1..{10**7}, not {self.episodes}")
         require(
             0 <= self.first_seed <= 2**32 - 1 - self.episodes,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from learner.presets import preset_config
 from learner.run_folder import RunFolder
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig
+from sim_core.outcomes import Outcome
 from tests.integration.conftest import SMALL
 
 FIRST_SEED = 2_000_000_000
@@ -55,8 +57,14 @@ def assert_same_stats(stored, expected):
         np.testing.assert_array_equal(first, second)
 
 
-@pytest.mark.parametrize("baseline", Baseline)
-@pytest.mark.parametrize("method", ["sensor", "in", "out"])
+PLAYED = [
+    *((baseline, method) for baseline in Baseline if baseline != "field" for method in ("sensor", "in", "out")),
+    (Baseline.FIELD, "in"),
+]
+"""Baselines with the methods that have them."""
+
+
+@pytest.mark.parametrize(("baseline", "method"), PLAYED)
 def test_a_baseline_is_stored_as_it_was_played(capsys, folder, baseline, method):
     arguments = ["--method", method, "--robots", "4", "--groups", "1", "--episodes", "5", "--out", "new/e.zarr"]
     assert main(["evaluate", str(baseline), *arguments]) == 0
@@ -93,7 +101,7 @@ def test_a_policy_is_stored_as_it_was_played_on_another_setup(capsys, folder):
     assert_same_stats(stored.stats, evaluate(spec, weights, list(range(9, 14))))
 
 
-@pytest.mark.parametrize("player", ["r", *Baseline])
+@pytest.mark.parametrize("player", ["r", *(baseline for baseline in Baseline if baseline != "field")])
 def test_the_first_episodes_are_recorded_whole(folder, player):
     make_run()
     assert main(["evaluate", player, "--robots", "3", "--episodes", "4", "--record", "2", "--out", "e.zarr"]) == 0
@@ -118,7 +126,17 @@ def test_a_baselines_name_is_taken_and_a_run_of_that_name_is_named_as_a_folder(c
     [
         (["r", "--preset", "best"], ["--preset", "'r' has a preset of its own"]),
         (["r", "--checkpoint", "step-7"], ["no checkpoint 'step-7'", "there are: none"]),
-        (["r", "--method", "in"], ["--method", "fl-orca, greedy, random", "'r' has a method of its own"]),
+        (
+            ["r", "--method", "in"],
+            ["--method", "fl-orca, fl-orca-snapped, greedy, field, random", "'r' has a method of its own"],
+        ),
+        (["field", "--method", "out"], ["method out has no rule field", "fl-orca, fl-orca-snapped, greedy, random"]),
+        (["r", "greedy", "--method", "in"], ["--method", "'r' has a method of its own"]),
+        (["r", "r"], ["name each player once"]),
+        (["r", "random", "--out", "e.zarr"], ["--out", "evaluate it alone"]),
+        (["r", "wide"], ["wide and r do not start alike"]),
+        (["r", "c"], ["c plays CartPole-v1, whose episodes have no outcomes"]),
+        (["several", "--out", "e.zarr"], ["'several' has learned 2", "--robots and --groups"]),
         (["greedy", "--method", "touch"], ["method must be one of", "touch"]),
         (["greedy", "--robots", "1"], ["robots", "at least 2"]),
         (["fl-orca", "--robots", "400"], ["does not fit"]),
@@ -144,6 +162,8 @@ def test_refused_before_anything_is_played(capsys, folder, monkeypatch, argument
 
     make_run()
     make_run("c", env_id="CartPole-v1")
+    make_run("wide", world=dataclasses.replace(SMALL.world, arena_radius_m=4.0))
+    make_run("several", setups=("3x2", "4x1"))
     (folder / "taken.zarr").mkdir()
     (folder / "half-episodes.zarr").mkdir()
     monkeypatch.setattr(playing, "evaluate_in_tasks", played)
@@ -157,6 +177,55 @@ def test_refused_before_anything_is_played(capsys, folder, monkeypatch, argument
     for word in words:
         assert word in error
     assert sorted(path.name for path in folder.iterdir()) == ["half-episodes.zarr", "runs", "taken.zarr"]
+
+
+def rates(printed):
+    """Rows of a printed table of players: name to the texts of its cells."""
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in printed.splitlines() if "│" in line]
+    return [row for row in rows if len(row) == 7]
+
+
+def test_players_meet_the_same_scenes_and_differ_in_pairs(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
+    _, config, weights = make_run()
+    assert main(["evaluate", "greedy", "r", "fl-orca", "--episodes", "40", "--first-seed", "5"]) == 0
+    rows = rates(capsys.readouterr().out)
+    seeds, spec = list(range(5, 45)), config.env
+    goals = [
+        evaluate(spec, player, seeds).outcome == int(Outcome.GOAL)
+        for player in (Baseline.GREEDY, weights, Baseline.FL_ORCA)
+    ]
+    assert [row[1] for row in rows] == ["greedy", "r", "fl-orca"] and rows[0][0] == config.world.setup
+    for row, reached in zip(rows, goals, strict=True):
+        assert row[2] == f"{100 * reached.mean():.1f} %"
+    assert rows[0][4:] == ["", "", ""]
+    for row, reached in zip(rows[1:], goals[1:], strict=True):
+        assert row[4] == f"{100 * (reached.mean() - goals[0].mean()):+.1f}"
+        assert row[6].startswith(f"{(reached & ~goals[0]).sum()} : {(goals[0] & ~reached).sum()}, p = ")
+
+
+def test_a_policy_of_several_setups_is_evaluated_in_each(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
+    _, config, weights = make_run(setups=("3x2", "4x1"))
+    assert main(["evaluate", "r", "--episodes", "30"]) == 0
+    printed = capsys.readouterr().out
+    seeds, total = list(range(FIRST_SEED, FIRST_SEED + 30)), 0
+    for robots, groups in ((3, 2), (4, 1)):
+        spec = EnvSpec(ENV_ID, dataclasses.replace(config.world, robots=robots, groups=groups))
+        reached = int((evaluate(spec, weights, seeds).outcome == int(Outcome.GOAL)).sum())
+        total += reached
+        assert re.search(rf"{robots}r×{groups}g\W+{100 * reached / 30:.1f} %", printed)
+    assert "sensor in 2 setups: 60 greedy episodes" in printed
+    assert re.search(rf"success rate\W+{100 * total / 60:.1f} %", printed)
+    assert main(["evaluate", "r", "greedy", "--episodes", "8"]) == 0
+    assert [row[:2] for row in rates(capsys.readouterr().out)] == [
+        ["3r×2g", "r"],
+        ["", "greedy"],
+        ["4r×1g", "r"],
+        ["", "greedy"],
+    ]
+    assert main(["evaluate", "r", "--robots", "5", "--episodes", "3"]) == 0
+    assert "sensor 5r×2g: 3 greedy episodes" in capsys.readouterr().out
 
 
 def test_without_record_older_episodes_are_no_obstacle(folder):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from actors.evaluation.statistics import dispersion, mean, rate, ratio
+from actors.evaluation.statistics import dispersion, mean, paired_comparison, rate, ratio
 
 
 def wilson(count, total):
@@ -88,3 +88,43 @@ def test_the_interval_of_a_ratio_has_its_nominal_coverage():
 def test_a_ratio_without_clusters_equals_a_rate():
     assert ratio([[(3, 10)], [(5, 20)]]) == rate(8, 30)
     assert ratio([[(5, 10), (5, 10)]]) == rate(10, 20), "never narrower than binomial"
+
+
+def flags(both, won, lost, neither):
+    """(first, second): successes of two players in as many episodes of each kind."""
+    first = np.repeat([True, False, True, False], (both, won, lost, neither))
+    second = np.repeat([True, True, False, False], (both, won, lost, neither))
+    return first, second
+
+
+def test_a_paired_difference_is_that_of_bonett_and_price():
+    found = paired_comparison(*flags(36, 3, 12, 49))
+    up, down = 4 / 102, 13 / 102  # written out: p12 and p21 with one episode added to each
+    half = stats.norm.ppf(0.975) * math.sqrt((up + down - (up - down) ** 2) / 102)
+    assert found.difference == pytest.approx((-0.09, up - down - half, up - down + half))
+    assert (found.won, found.lost) == (3, 12)
+    sign = 2 * sum(math.comb(15, k) for k in range(4)) / 2**15
+    assert found.p_value == pytest.approx(sign)
+
+
+def test_equal_players_do_not_differ():
+    found = paired_comparison(*flags(7, 0, 0, 3))
+    assert found.difference.value == 0 and found.difference.low < 0 < found.difference.high
+    assert (found.won, found.lost, found.p_value) == (0, 0, 1.0)
+    for first, second in (([], []), ([True], [True, False])):
+        with pytest.raises(ValueError, match="equally many"):
+            paired_comparison(np.array(first, bool), np.array(second, bool))
+
+
+def test_the_paired_interval_has_its_coverage_and_is_narrower_than_an_unpaired_one():
+    rng, hits, narrower = np.random.default_rng(0), 0, 0
+    for _ in range(2_000):
+        first = rng.random(300) < 0.9
+        second = np.where(rng.random(300) < 0.9, first, rng.random(300) < 0.7)  # they share most episodes
+        found = paired_comparison(first, second)
+        hits += found.difference.low <= 0.1 * (0.7 - 0.9) <= found.difference.high
+        ends = [rate(int(player.sum()), 300) for player in (first, second)]
+        unpaired = math.sqrt(sum((end.high - end.low) ** 2 for end in ends))
+        narrower += found.difference.high - found.difference.low < unpaired
+    assert 0.94 <= hits / 2_000 <= 0.97
+    assert narrower == 2_000
