@@ -92,10 +92,14 @@ def metadata(config: RunConfig, weights: WeightsSnapshot, bare: bool) -> dict[st
     """The metadata of an exported file, in addition to its inputs and outputs."""
     world = config.world
     robot = {} if bare else {"method": world.method_name, "setup": world.setup, "frame": FRAME}
-    timing = {} if bare else {"time_step_s": world.time_step_s, "outer_radius_m": world.outer_radius_m}
+    timing = {
+        "time_step_s": world.time_step_s,
+        "decision_interval_steps": world.decision_interval_steps,
+        "outer_radius_m": world.outer_radius_m,
+    }
     origin = {"run": config.name, "config_hash": config_hash(config), "updates": weights.version}
     settings = {"commit": git_commit(), "settings": to_dict(config)}
-    return {"format": FORMAT, "env_id": config.env_id, **robot, **timing, **origin, **settings}
+    return {"format": FORMAT, "env_id": config.env_id, **robot, **({} if bare else timing), **origin, **settings}
 
 
 def run(command: Export) -> int:

@@ -28,12 +28,16 @@ def load(folder: Path) -> tuple[Any, dict[str, Any]]:
     return policy, json.loads((folder / "policy.json").read_text("utf-8"))
 
 
-def sense(method: str, robot: Any, groups: Any, goals: Any) -> dict[str, Any]:
-    """The robot's input, a batch of one: positions of the other robots relative to it, in metres, own group first."""
+def sense(method: str, robot: Any, groups: Any, goals: Any, held: int) -> dict[str, Any]:
+    """The robot's input, a batch of one: positions of the other robots relative to it, in metres, own group first.
+
+    `held` is the action of the last decision, -1 to decide.
+    """
     positions = (groups - robot)[None].astype(np.float32)  # [1, groups, robots, 2]
     mask = np.ones(positions.shape[:3], bool)  # False for a robot that is not sensed
     if method != "sensor":
-        return {"positions": positions, "mask": mask, "goals": (goals - robot)[None].astype(np.float32)}
+        inputs = {"positions": positions, "mask": mask, "goals": (goals - robot)[None].astype(np.float32)}
+        return inputs | ({"held": np.array([held])} if method == "out" else {})
     other, other_mask = positions[:, 1:].reshape(1, -1, 2), mask[:, 1:].reshape(1, -1)
     return {"own": positions[:, 0], "own_mask": mask[:, 0], "other": other, "other_mask": other_mask}
 
@@ -44,17 +48,19 @@ def main(folder: Path, seconds: float = 12.0, walk_m_s: float = 0.5) -> None:
     tick_s, count = about["time_step_s"], about["settings"]["world"]["groups"]
     starts = 6.0 * np.stack([turn(np.arange(count) * 2 * np.pi / count) for turn in (np.cos, np.sin)], axis=1)
     groups = starts[:, None] + np.random.default_rng(0).uniform(-0.7, 0.7, (count, 6, 2))
-    robot, goals, spent_s = starts[0].copy(), -starts, 0.0
+    robot, goals, spent_s, action = starts[0].copy(), -starts, 0.0, np.array([-1])
     for tick in range(round(seconds / tick_s)):
-        begin_s = time.perf_counter()
-        (velocity,) = policy.run(["velocity"], sense(about["method"], robot, groups, goals))
+        decides, begin_s = tick % about["decision_interval_steps"] == 0, time.perf_counter()
+        if decides or about["method"] == "out":  # M_OUT's potential field acts between decisions, too
+            held = -1 if decides else int(action[0])
+            velocity, action = policy.run(["velocity", "action"], sense(about["method"], robot, groups, goals, held))
         spent_s += time.perf_counter() - begin_s
         robot += velocity[0] * tick_s
         groups += walk_m_s * tick_s * (goals / np.linalg.norm(goals, axis=1, keepdims=True))[:, None]
         if tick % round(1 / tick_s) == 0:
             away_m = np.linalg.norm(robot - groups[0].mean(axis=0))
             print(f"{tick * tick_s:.0f} s: drives {velocity[0].round(2)} m/s, {away_m:.2f} m from its group")
-    print(f"{1e6 * spent_s / (tick + 1):.0f} us a decision")
+    print(f"{1e6 * spent_s / (tick + 1):.0f} us a tick")
 
 
 main(Path(sys.argv[1]))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -24,6 +25,8 @@ from sim_core.worlds import WorldBatch
 
 NO_DECISION = -1
 """Action where the state cannot be formed."""
+DECIDE = -1
+"""Stands for no held action: the robot decides."""
 
 
 class RepulsiveField(nn.Module):
@@ -206,12 +209,37 @@ class InsideRobot(EllipseRobot):
 
 
 class OutsideRobot(EllipseRobot):
-    """M_OUT: velocity u_nn + u_apf.
+    """M_OUT: velocity u_nn + u_apf. Between two decisions u_nn stays, and u_apf is that of every simulator step.
 
     Args:
       network: the trained network.
       config: the world that it was trained in.
     """
+
+    @classmethod
+    def inputs(cls, config: WorldConfig) -> list[Port]:
+        """As the others', and the action to hold."""
+        meaning = f"the action of the last decision, to go on with it, or {DECIDE} to decide"
+        return [*super().inputs(config), Port("held", "int64", ("batch",), "", meaning)]
+
+    @classmethod
+    def sense(cls, worlds: WorldBatch) -> dict[str, NDArray[Any]]:
+        """As the others', with no held action."""
+        return super().sense(worlds) | {"held": np.full(worlds.num_worlds, DECIDE)}
+
+    def forward(self, positions: Tensor, mask: Tensor, goals: Tensor, held: Tensor) -> Decision:  # type: ignore[override]
+        """Decides for a batch of robots, or goes on with their decisions.
+
+        Args:
+          positions, mask, goals: as the others'.
+          held: `[batch]` int64, the action of the last decision, or DECIDE.
+        """
+        velocity, action, values, observation = super().forward(positions, mask, goals)
+        positions = torch.where(mask.unsqueeze(-1), positions, 0.0)
+        held_velocity = self._velocity(held.clamp(min=0), positions, mask)
+        holds = (held >= 0) & (action != NO_DECISION)
+        velocity = torch.where(holds.unsqueeze(1), held_velocity, velocity)
+        return velocity, torch.where(holds, held, action), values, observation
 
     def _velocity(self, action: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
         """The velocity `[batch, 2]` float32 of an action: u_nn + u_apf, no faster than the limit."""

@@ -92,7 +92,7 @@ class RobotModule(nn.Module):
                 "float32",
                 ("batch", 2),
                 "m/s",
-                f"what to drive until the next decision, at most {speed} m/s",
+                f"what to drive, at most {speed} m/s",
             ),
             Port("action", "int64", ("batch",), "", heading),
             Port("action_values", "float32", ("batch", config.num_actions), "", values),

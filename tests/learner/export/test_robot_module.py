@@ -14,6 +14,7 @@ from learner.export.robot_module import make_robot
 from sim_core.config import WorldConfig
 from sim_core.methods import make_method
 from sim_core.methods.apf import field_params, repulsion
+from sim_core.worlds import WorldBatch
 
 NAMES = ("velocity", "action", "action_values", "observation")
 WORLDS = {
@@ -72,6 +73,33 @@ def test_it_decides_as_the_simulator_with_its_policy(config):
     np.testing.assert_allclose(
         found["action_values"][same], states.expected["action_values"][same], rtol=1e-4, atol=1e-4
     )
+
+
+@pytest.mark.parametrize("method", ["sensor", "in", "out"])
+def test_between_decisions_it_drives_as_the_simulator(method):
+    config = WorldConfig(method=method, robots=5, groups=2, arena_radius_m=2.0, decision_interval_steps=5)
+    robot, worlds, sensed, driven = make_robot(lively(config), config), WorldBatch(config, 40), [], []
+    worlds.reset()
+
+    def watch():
+        learner = worlds.state.learner
+        driven.append(np.stack([worlds.state.vel_x, worlds.state.vel_y], axis=-1)[np.arange(40), learner])
+        sensed.append(robot.sense(worlds))
+
+    different = 0
+    for _ in range(8):
+        sensed, driven = [robot.sense(worlds)], []
+        action = decide(robot, *sensed[0].values())["action"]
+        worlds.step(action, watch)
+        running = worlds.state.steps[:, None] == worlds.state.steps.max()  # the others stopped where they ended
+        for step, inputs in enumerate(sensed[:-1]):
+            if step and "held" in inputs:
+                inputs["held"] = action
+            if step == 0 or "held" in inputs:
+                velocity = decide(robot, *inputs.values())["velocity"]
+            np.testing.assert_allclose(driven[step][running[:, 0]], velocity[running[:, 0]], atol=2e-5)
+        different += int((np.abs(np.diff(driven, axis=0)).max(axis=(0, 2)) > 0.01).sum())
+    assert (different > 20) == (method == "out"), "u_apf changes within a decision"
 
 
 @pytest.mark.parametrize("config", WORLDS.values(), ids=WORLDS)
@@ -153,7 +181,7 @@ def test_without_a_robot_of_every_group_there_is_no_decision():
     positions, goals = np.ones((2, 2, 4, 2), np.float32), np.ones((2, 2, 2), np.float32)
     mask = np.ones((2, 2, 4), bool)
     mask[1, 1] = False
-    found = decide(make_robot(lively(config), config), positions, mask, goals)
+    found = decide(make_robot(lively(config), config), positions, mask, goals, np.array([-1, -1]))
     assert found["action"][0] != NO_DECISION and np.abs(found["velocity"][0]).max() > 0.0
     assert found["action"][1] == NO_DECISION and (found["velocity"][1] == 0.0).all()
     assert np.isfinite(found["action_values"]).all()
