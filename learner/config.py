@@ -90,8 +90,9 @@ class RunConfig:
     """TD target: Double DQN (Algorithm 2) or DQN (Algorithm 1)."""
     hidden_sizes: tuple[int, ...] = (128, 128)
     """Widths of the Q-network's hidden layers."""
-    network: Literal["plain", "dueling"] = "plain"
-    """One stream, or two, for state value and advantages, from the last hidden layer on (Wang et al. 2016)."""
+    network: Literal["plain", "dueling", "pooled"] = "plain"
+    """One stream; two, for state value and advantages, from the last hidden layer on (Wang et al. 2016); or, for in and
+    out, layers that the other groups' rows share, and their maximum (Zaheer et al. 2017); the first width is theirs."""
     discount: float = 0.99
     """Discount per env step, gamma (the dissertation's lambda = 0.001 cannot be a discount)."""
     n_step: int = 3
@@ -143,6 +144,7 @@ class RunConfig:
         _check_ranges(self)
         _check_pairs(self)
         _check_setups(self)
+        _check_network(self)
 
     @cached_property
     def env(self) -> EnvSpec:
@@ -288,6 +290,15 @@ def _share(text: str) -> float:
         return math.nan
 
 
+def _check_network(config: RunConfig) -> None:
+    if config.network == "pooled":
+        require(
+            config.env.row_size > 0,
+            f"network must be plain or dueling for {config.title}, whose observations are no rows of groups; pooled is "
+            "for methods in and out",
+        )
+
+
 def _check_setups(config: RunConfig) -> None:
     require(
         isinstance(config.setups, tuple) and all(isinstance(text, str) for text in config.setups),
@@ -298,10 +309,12 @@ def _check_setups(config: RunConfig) -> None:
     require(config.env.is_swarm, f"setups are those of our own environment, not of {config.env_id}")
     worlds = config.env.worlds
     groups = {world.groups for world in worlds}
+    sizes = {len(world.method_class.observation_names(world)) for world in worlds}
     require(
-        config.world.method_class.fits_any_groups or groups == {config.world.groups},
-        f"setups must all have groups = {config.world.groups}, not {sorted(groups)}: the state of method "
-        f"{config.world.method_name} grows with the groups, and one network takes states of one size",
+        len(sizes) == 1,
+        f"setups must all have equally many groups, not {sorted(groups)}: the state of method "
+        f"{config.world.method_name} grows with the groups, and one network takes states of one size; for in and out, "
+        f"group_rows = {max(groups)} pads it",
     )
     require(
         config.envs_per_worker >= len(worlds),

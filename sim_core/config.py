@@ -82,6 +82,8 @@ class WorldConfig:
     """`in`, `out`: no half-axis is shorter, so that robots in a line span an ellipse (not given in the text)."""
     group_order: Literal["fixed", "nearest"] = "fixed"
     """`in`, `out`: order of the other groups' rows, after the own one: around the circle, or by distance (open)."""
+    group_rows: int = 0
+    """`in`, `out`: rows of the state, of which those without a group are zeros; 0: one a group (4.2.1)."""
     ellipse_scale_per_m: float = 0.5
     """`in`, `out`: factor of half-axes and of centres relative to the learning robot (not given in the text)."""
     goal_scale_per_m: float = 0.15
@@ -264,6 +266,10 @@ def _check_counts(config: WorldConfig) -> None:
     require(
         config.robots >= 2,
         f"robots must be at least 2 per group (the learning robot needs one to follow), not {config.robots}",
+    )
+    require(
+        config.group_rows == 0 or config.group_rows >= config.groups,
+        f"group_rows must be 0 or at least groups ({config.groups}), not {config.group_rows}",
     )
     require(config.groups >= 1, f"groups must be at least 1, not {config.groups}")
     require(2 <= config.sectors <= MAX_HEADINGS, f"sectors must be between 2 and {MAX_HEADINGS}, not {config.sectors}")

@@ -62,7 +62,48 @@ class DuelingNetwork(nn.Module):
         return values
 
 
-NETWORKS: dict[str, type[QNetwork] | type[DuelingNetwork]] = {"plain": QNetwork, "dueling": DuelingNetwork}
+class PooledNetwork(nn.Module):
+    """A Q-network over rows of groups that does not depend on the order and number of the other groups.
+
+    Two layers, the same for every row but the first, encode a row; the maximum over the rows, beside the first row,
+    goes through a multilayer perceptron. M. Zaheer et al., "Deep sets" (NeurIPS 2017), Section 3. A row of zeros is
+    absent.
+
+    Args:
+      observation_size: number of elements of one observation, a multiple of `row_size`.
+      hidden_sizes: width of both shared layers, then of the perceptron's hidden layers.
+      num_actions: number of actions.
+      row_size: elements of a row.
+    """
+
+    def __init__(self, observation_size: int, hidden_sizes: tuple[int, ...], num_actions: int, row_size: int) -> None:
+        super().__init__()
+        self.shape = (observation_size // row_size, row_size)
+        width, *hidden = hidden_sizes
+        self.rows = nn.Sequential(nn.Linear(row_size, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
+        self.values = QNetwork(row_size + width, tuple(hidden), num_actions)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Action values `[batch, actions]` float32."""
+        rows = observation.float().reshape(-1, *self.shape)
+        own, others = rows[:, 0], rows[:, 1:]
+        here = (others[..., :1] != 0.0).float()
+        pooled = (self.rows(others) * here).amax(dim=1) if self.shape[0] > 1 else self.rows(own) * 0.0
+        values: Tensor = self.values(torch.cat([own, pooled], dim=1))
+        return values
+
+
+Network = QNetwork | DuelingNetwork | PooledNetwork
+
+
+def make_network(
+    kind: str, observation_size: int, hidden_sizes: tuple[int, ...], num_actions: int, row_size: int = 0
+) -> Network:
+    """A network of the kind `plain`, `dueling` or `pooled`; `row_size` is that of pooled ones."""
+    if kind == "pooled":
+        return PooledNetwork(observation_size, hidden_sizes, num_actions, row_size)
+    made = DuelingNetwork if kind == "dueling" else QNetwork
+    return made(observation_size, hidden_sizes, num_actions)
 
 
 def fold_dueling_head(value: tuple[Tensor, Tensor], advantage: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
@@ -79,17 +120,17 @@ def fold_dueling_head(value: tuple[Tensor, Tensor], advantage: tuple[Tensor, Ten
     return torch.cat([value_weight.expand_as(centred), centred], dim=1), value_bias + bias - bias.mean()
 
 
-def snapshot(network: QNetwork | DuelingNetwork, version: int, time_s: float) -> WeightsSnapshot:
+def snapshot(network: Network, version: int, time_s: float) -> WeightsSnapshot:
     """Copies the parameters of a network; those of a dueling network as the plain network that it is equal to."""
     parameters = [parameter.detach() for parameter in network.parameters()]
     if isinstance(network, DuelingNetwork):
         *parameters, value_weight, value_bias, weight, bias = parameters
         parameters += fold_dueling_head((value_weight, value_bias), (weight, bias))
     arrays = tuple(parameter.cpu().numpy().copy() for parameter in parameters)
-    return WeightsSnapshot(version, time_s, arrays)
+    return WeightsSnapshot(version, time_s, arrays, network.shape[1] if isinstance(network, PooledNetwork) else 0)
 
 
-def load_snapshot(network: QNetwork, weights: WeightsSnapshot) -> None:
+def load_snapshot(network: Network, weights: WeightsSnapshot) -> None:
     """Copies the parameters of a snapshot into a network.
 
     Raises:

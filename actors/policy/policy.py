@@ -11,7 +11,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.policy.mlp_kernels import Floats, Layers, best_action, forward, make_workspace
+from actors.policy.mlp_kernels import (
+    Floats,
+    Layers,
+    RowEncoder,
+    best_action,
+    encode_rows,
+    forward,
+    make_row_encoder,
+    make_workspace,
+)
 from sim_core.jit import kernel
 
 
@@ -19,12 +28,14 @@ class WeightsSnapshot(NamedTuple):
     """A published policy.
 
     `version` is the number of updates applied to the weights, `time_s` the wall time of their publication. `arrays`
-    holds the weights `[fan_out, fan_in]` and biases `[fan_out]` of a plain network, layer by layer.
+    holds the weights `[fan_out, fan_in]` and biases `[fan_out]` layer by layer: of a plain network, or if `row_size` is
+    above 0, of a pooled one whose observations are rows of so many elements.
     """
 
     version: int
     time_s: float
     arrays: tuple[NDArray[np.float32], ...]
+    row_size: int = 0
 
 
 class Policy:
@@ -39,8 +50,11 @@ class Policy:
     def __init__(self, weights: WeightsSnapshot) -> None:
         self.weights = weights
         copies = [array.copy() for array in weights.arrays]  # arrays from Ray are read-only: another numba type
-        self._layers = Layers(tuple(copies[::2]), tuple(copies[1::2]))
+        shared = 4 if weights.row_size else 0  # arrays of the two layers that all rows share
+        self._shared = Layers(tuple(copies[:shared:2]), tuple(copies[1:shared:2]))
+        self._layers = Layers(tuple(copies[shared::2]), tuple(copies[shared + 1 :: 2]))
         self._workspace = make_workspace(0, self._layers)
+        self._encoder: RowEncoder | None = None
 
     def values(self, observation: NDArray[np.generic]) -> NDArray[np.float32]:
         """Action values `[batch, actions]` float32 of observations `[batch, *shape]`."""
@@ -58,8 +72,19 @@ class Policy:
     def _load(self, observation: NDArray[np.generic]) -> None:
         count = len(observation)
         if len(self._workspace[0]) != count:
-            self._workspace = make_workspace(count, self._layers)
-        self._workspace[0][...] = observation.reshape(count, -1)
+            self._workspace, self._encoder = make_workspace(count, self._layers), None
+        if not self.weights.row_size:
+            self._workspace[0][...] = observation.reshape(count, -1)
+            return
+        rows = np.ascontiguousarray(observation.reshape(count, -1), np.float32)
+        if self._encoder is None:
+            self._encoder = make_row_encoder(count, rows.shape[1] // self.weights.row_size, self._shared)
+        _encode(rows, self._shared, self._encoder, self._workspace[0])
+
+
+@kernel
+def _encode(observations: Floats, shared: Layers, encoder: RowEncoder, out: Floats) -> None:
+    encode_rows(observations, 0, shared, encoder, out)
 
 
 @kernel

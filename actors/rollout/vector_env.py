@@ -33,6 +33,11 @@ class EnvSpec(NamedTuple):
         """The worlds of all setups."""
         return [world for world, _ in self.shares] or [self.world]
 
+    @property
+    def row_size(self) -> int:
+        """Elements of a row, where an observation is rows of groups; else 0."""
+        return self.world.method_class.row_size if self.is_swarm else 0
+
     def of_setup(self, world: WorldConfig) -> EnvSpec:
         """The environment of one setup alone."""
         return EnvSpec(self.env_id, world)

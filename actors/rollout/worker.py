@@ -137,9 +137,9 @@ class RolloutWorker:
             arrays |= {f"world_{name}": array for name, array in self._env.get_state().items()}
         meta = {"sequence": self._sequence, "rng": self._rng.bit_generator.state, "policy": None}
         if self._policy is not None:
-            version, time_s, layers = self._policy.weights
+            version, time_s, layers, row_size = self._policy.weights
             arrays |= {f"policy_{i}": array for i, array in enumerate(layers)}
-            meta["policy"] = [version, time_s]
+            meta["policy"] = [version, time_s, row_size]
         return {"arrays": arrays, "meta": meta}
 
     def set_state(self, arrays: dict[str, NDArray[Any]], meta: dict[str, Any]) -> None:
@@ -148,9 +148,9 @@ class RolloutWorker:
         self._rng.bit_generator.state = meta["rng"]
         if meta["policy"] is not None:
             count = sum(name.startswith("policy_") for name in arrays)
-            version, time_s = meta["policy"]
+            version, time_s, row_size = meta["policy"]
             layers = tuple(arrays[f"policy_{i}"] for i in range(count))
-            self.set_weights(WeightsSnapshot(version, time_s, layers))
+            self.set_weights(WeightsSnapshot(version, time_s, layers, row_size))
         if not isinstance(self._env, SwarmVectorEnv | JoinedVectorEnv):
             return
         worlds = {name.removeprefix("world_"): array for name, array in arrays.items() if name.startswith("world_")}

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import nn
 
-from actors.policy.network import QNetwork, load_snapshot
+from actors.policy.network import load_snapshot
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import env_shape
 from deploy.options.results import Export
@@ -26,6 +26,7 @@ from learner.export.robot_module import BarePolicy, make_robot, robot_class
 from learner.export.write import Agreement, check_packages, write_export
 from learner.run_folder import RunFolder, find_run
 from learner.tracking.mlflow_run import git_commit
+from learner.update.networks import acting_network
 from sim_core.checks import require
 
 FORMAT = "shoal-policy-1"
@@ -75,7 +76,7 @@ class _Exportable(NamedTuple):
 
 def _exportable(command: Export, config: RunConfig, weights: WeightsSnapshot) -> _Exportable:
     shape = env_shape(config.env)
-    network = QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions)
+    network = acting_network(config, shape)
     load_snapshot(network, weights)
     if command.bare:
         states = observed_states(config.env, weights, command.first_seed, command.states)

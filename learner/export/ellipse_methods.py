@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
-from actors.policy.network import QNetwork
+from actors.policy.network import Network
 from learner.export.ports import Port
 from learner.export.robot_module import Decision, RobotModule, relative_positions
 from sim_core.config import WorldConfig
@@ -73,12 +74,14 @@ class EllipseRobot(RobotModule):
     places: Tensor
     undecided = "; -1 and no velocity where a group has no robot"
 
-    def __init__(self, network: QNetwork, config: WorldConfig) -> None:
+    def __init__(self, network: Network, config: WorldConfig) -> None:
         super().__init__(network, config)
         self.config = config
         self.ellipse = ellipse_params(config)
         self.field = RepulsiveField(config)
         self.limit = observation_limit(config)
+        method = config.method_class
+        self.absent = len(method.observation_names(config)) - config.groups * method.row_size
         counted = torch.zeros(config.groups, dtype=torch.float64)
         counted[0] = float(self.ellipse.counts_learner)
         self.register_buffer("counted", counted)  # the robot itself, in the ellipse of its own group
@@ -101,10 +104,11 @@ class EllipseRobot(RobotModule):
     @classmethod
     def observation_meaning(cls, config: WorldConfig) -> str:
         """Rows of groups."""
-        columns = len(config.method_class.observation_names(config)) // config.groups
+        columns, size = config.method_class.row_size, len(config.method_class.observation_names(config))
         return (
-            f"rows of groups, each {', '.join(COLUMN_NAMES[:columns])}; lengths of ellipses × "
-            f"{config.ellipse_scale_per_m} per m, goals × {config.goal_scale_per_m} per m, theta in rad"
+            f"{size // columns} rows of groups, zeros where there is none, each {', '.join(COLUMN_NAMES[:columns])}; "
+            f"lengths of ellipses × {config.ellipse_scale_per_m} per m, goals × {config.goal_scale_per_m} per m, theta "
+            "in rad"
         )
 
     @classmethod
@@ -184,7 +188,7 @@ class EllipseRobot(RobotModule):
         matrix = self._matrix(positions, mask, goals)
         if self.config.group_order == "nearest":
             matrix = self._nearest_first(matrix, positions, mask)
-        observation = matrix.flatten(1)
+        observation = functional.pad(matrix.flatten(1), (0, self.absent))
         values = self.network(observation)
         known = mask.any(2).all(1)
         action = values.argmax(1)

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from actors.policy.network import QNetwork
+from actors.policy.network import Network
 from learner.export.ports import Port
 from learner.export.robot_module import Decision, RobotModule, relative_positions
 from sim_core.config import WorldConfig
@@ -28,7 +28,7 @@ class SensorRobot(RobotModule):
     edges: Tensor
     cells: Tensor
 
-    def __init__(self, network: QNetwork, config: WorldConfig) -> None:
+    def __init__(self, network: Network, config: WorldConfig) -> None:
         super().__init__(network, config)
         self.sectors = config.sectors
         self.separate = config.sensor_counts == "separate"

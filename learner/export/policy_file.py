@@ -8,7 +8,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from actors.policy.network import NETWORKS, DuelingNetwork, QNetwork, load_snapshot, snapshot
+from actors.policy.network import Network, load_snapshot, snapshot
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import EnvShape
 from actors.storage.atomic_write import replacing_file
@@ -17,6 +17,7 @@ from learner.checkpoints.checkpoint import Checkpoint
 from learner.checkpoints.manifest import CheckpointError, damaged
 from learner.config import RunConfig
 from learner.update.learner_node import WEIGHTS
+from learner.update.networks import acting_network, learning_network
 
 AVERAGE, ONLINE = "average.", "online."
 """Networks of a checkpoint; the policy is the average where there is one."""
@@ -31,14 +32,14 @@ def read_policy(checkpoint: Checkpoint, config: RunConfig, shape: EnvShape) -> W
     updates = checkpoint.state.get("updates")
     if type(updates) is not int:
         raise damaged(checkpoint.folder, "state.json has no number of updates")
-    network = NETWORKS[config.network](shape.observation_size, config.hidden_sizes, shape.num_actions)
+    network = learning_network(config, shape)
     with fetched(join_location(checkpoint.folder, WEIGHTS)) as path:
         return _read(path, updates, network)
 
 
 def save_policy(path: Path, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> None:
-    """Writes a policy to a file of its own, as a plain network; an older one is replaced once the new is whole."""
-    network = QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions)
+    """Writes a policy to a file of its own, ready to act; an older one is replaced once the new is whole."""
+    network = acting_network(config, shape)
     load_snapshot(network, weights)
     tensors = {f"{ONLINE}{name}": tensor for name, tensor in network.state_dict().items()}
     with replacing_file(path) as partial:
@@ -56,10 +57,10 @@ def read_saved_policy(path: Path, config: RunConfig, shape: EnvShape) -> Weights
             updates = int((file.metadata() or {})["updates"])
     except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise CheckpointError(f"the policy {path} cannot be read ({error}); start a new run") from error
-    return _read(path, updates, QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions))
+    return _read(path, updates, acting_network(config, shape))
 
 
-def _read(path: Path, updates: int, network: QNetwork | DuelingNetwork) -> WeightsSnapshot:
+def _read(path: Path, updates: int, network: Network) -> WeightsSnapshot:
     try:
         network.load_state_dict(_policy(load_file(str(path))))
     except (RuntimeError, OSError, SafetensorError) as error:

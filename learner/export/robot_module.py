@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from actors.policy.network import QNetwork
+from actors.policy.network import Network
 from learner.export.ports import Port
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
@@ -36,7 +36,7 @@ class BarePolicy(nn.Module):
       network: the trained network.
     """
 
-    def __init__(self, network: QNetwork) -> None:
+    def __init__(self, network: Network) -> None:
         super().__init__()
         self.network = network
 
@@ -58,7 +58,7 @@ class RobotModule(nn.Module):
     undecided = ""
     """Said of an action where the state cannot be formed."""
 
-    def __init__(self, network: QNetwork, config: WorldConfig) -> None:
+    def __init__(self, network: Network, config: WorldConfig) -> None:
         super().__init__()
         self.network = network
         self.register_buffer("headings", torch.from_numpy(heading_velocities(config, "float32")))
@@ -117,7 +117,7 @@ def robot_class(config: WorldConfig) -> type[RobotModule]:
     return found
 
 
-def make_robot(network: QNetwork, config: WorldConfig) -> RobotModule:
+def make_robot(network: Network, config: WorldConfig) -> RobotModule:
     """The module of the world's method (see `robot_class` for errors)."""
     return robot_class(config)(network, config)
 

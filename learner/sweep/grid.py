@@ -268,7 +268,8 @@ def _extrapolation_setups(sweep: SweepConfig, cell: Cell) -> list[tuple[int, int
     world = cell.config.world
     if sweep.extrapolation == "none" or cell.policy != LEARNED:
         return []
-    groups = sweep.groups if world.method_class.fits_any_groups else (world.groups,)
+    most = world.method_class.max_groups(world)
+    groups = [g for g in sweep.groups if g == world.groups or (most > world.groups and g <= most)]
     return [(r, g) for r in sweep.robots for g in groups if (r, g) != (world.robots, world.groups)]
 
 

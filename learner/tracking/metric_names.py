@@ -57,7 +57,7 @@ LEARNING = (
     _gauge(
         "train/episode_length",
         "train_episode_length",
-        "env steps",
+        "steps",
         "mean length of training episodes since the last row",
         "below the horizon",
     ),
@@ -89,7 +89,7 @@ def _evaluated() -> tuple[MetricSpec, ...]:
         for end, text in ends.items()
     ]
     meaning = "mean length of the greedy episodes"
-    length = _gauge("eval/episode_length", "eval_episode_length", "env steps", meaning, "below the horizon")
+    length = _gauge("eval/episode_length", "eval_episode_length", "steps", meaning, "below the horizon")
     return (*rows, length)
 
 

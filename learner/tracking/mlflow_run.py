@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import torch
 
-from actors.policy.network import QNetwork, load_snapshot
+from actors.policy.network import load_snapshot
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import EnvShape
 from actors.service.fault_policy import first_line
@@ -28,6 +28,7 @@ from learner.file_names import USER_FILES
 from learner.tracking.journal import FINAL, Row, mlflow_metrics
 from learner.tracking.mlflow_views import TAG, packed_view, sweep_views
 from learner.tracking.redaction import hide_secrets, public_uri
+from learner.update.networks import acting_network
 from sim_core.checks import ConfigError
 
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
@@ -211,7 +212,7 @@ class Tracker:
           shape: shape of its environment.
           score: by which the registry ranks the policies of a setup.
         """
-        network = QNetwork(shape.observation_size, config.policy_sizes, shape.num_actions)
+        network = acting_network(config, shape)
         load_snapshot(network, weights)
         example = np.zeros((2, *shape.observation_space.shape), np.float32)
         with torch.no_grad():

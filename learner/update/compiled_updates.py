@@ -1,8 +1,8 @@
 """Compiled updates: a kernel makes all updates of a call, without Python or PyTorch between two minibatches.
 
-For plain networks on the CPU. Small networks are bound by overhead; here the overhead is a few loops over contiguous
-memory, and the matrix products are those of SciPy's BLAS. The arithmetic is that of `learner.update.gradients` and of
-PyTorch's Adam on the same memory, with equal results up to rounding.
+For plain and pooled networks on the CPU. Small networks are bound by overhead; here the overhead is a few loops over
+contiguous memory, and the matrix products are those of SciPy's BLAS. The arithmetic is that of
+`learner.update.gradients` and of PyTorch's Adam on the same memory, with equal results up to rounding.
 
 One shortcut: the gradient is non-zero only for the taken action, so the last layer's backward pass needs no matrix
 product.
@@ -17,7 +17,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from actors.policy.mlp_kernels import Floats, Layers, best_action, forward, make_workspace, multiply, squared_norm
+from actors.policy.mlp_kernels import (
+    Floats,
+    Layers,
+    RowEncoder,
+    best_action,
+    encode_rows,
+    forward,
+    make_row_encoder,
+    make_workspace,
+    multiply,
+    squared_norm,
+)
+from actors.policy.network import PooledNetwork
 from learner.config import RunConfig
 from learner.update.gradients import FlatNetwork
 from learner.update.updates import UpdateStats
@@ -59,6 +71,20 @@ class _Workspace(NamedTuple):
     grad: Floats
 
 
+class _Pooling(NamedTuple):
+    """What a pooled network has more: its shared layers, and memory for their outputs and gradients (`RowEncoder`).
+
+    `delta_encoded` and `delta_hidden` `[rows, width]` are the gradients with respect to the two layers' outputs.
+    """
+
+    online: Layers
+    target: Layers
+    grads: Layers
+    encoder: RowEncoder
+    delta_encoded: Floats
+    delta_hidden: Floats
+
+
 class _Hyperparameters(NamedTuple):
     """What the kernel needs of the config and of PyTorch's Adam; `target_rate` 0 copies the target by the interval."""
 
@@ -73,7 +99,7 @@ class _Hyperparameters(NamedTuple):
 
 
 class CompiledUpdates:
-    """Updates of a plain network on the CPU (see `Updates`).
+    """Updates of a plain or pooled network on the CPU (see `Updates`).
 
     Args:
       online, target: the networks; their memory is changed in place.
@@ -85,9 +111,17 @@ class CompiledUpdates:
         self, online: FlatNetwork, target: FlatNetwork, optimiser: torch.optim.Adam, config: RunConfig
     ) -> None:
         self._online, self._target, self._optimiser = online, target, optimiser
-        self._layers, self._target_layers = _arrays(online.layers), _arrays(target.layers)
-        self._grads = _arrays(online.grads)
         self._size = config.batch_size
+        shared = 2 if isinstance(online.network, PooledNetwork) else 0
+        self._layers, self._target_layers = _arrays(online.layers[shared:]), _arrays(target.layers[shared:])
+        self._grads = _arrays(online.grads[shared:])
+        self._pooling = None
+        if isinstance(online.network, PooledNetwork):
+            layers = _arrays(online.layers[:shared])
+            encoder = make_row_encoder(self._size, online.network.shape[0], layers)
+            deltas = np.zeros_like(encoder.encoded), np.zeros_like(encoder.hidden)
+            others = _arrays(target.layers[:shared]), _arrays(online.grads[:shared])
+            self._pooling = _Pooling(layers, *others, encoder, *deltas)
         group = optimiser.param_groups[0]
         self._hyper = _Hyperparameters(
             double=config.algorithm == "double_dqn",
@@ -115,7 +149,8 @@ class CompiledUpdates:
         sums = np.zeros(3)
         networks = (self._layers, self._target_layers, self._grads)
         workspace, hyper = self._workspace, self._hyper
-        _updates(batch, *networks, flat, workspace, hyper, learning_rate, updates, steps, td_errors, sums)
+        numbers = (learning_rate, updates, steps)
+        _updates(batch, *networks, self._pooling, flat, workspace, hyper, *numbers, td_errors, sums)
         return sums
 
     def __call__(self, columns: dict[str, Tensor], learning_rate: float, updates: int) -> tuple[UpdateStats, Floats]:
@@ -160,6 +195,7 @@ def _updates(
     online: Layers,
     target: Layers,
     grads: Layers,
+    pooling: _Pooling | None,
     flat: _Flat,
     workspace: _Workspace,
     hyper: _Hyperparameters,
@@ -173,7 +209,8 @@ def _updates(
 
     Args:
       batch: minibatch after minibatch.
-      online, target, grads: views of `flat`, layer by layer.
+      online, target, grads: views of `flat`, layer by layer, without the shared layers of a pooled network.
+      pooling: those; None for a plain network.
       flat: see _Flat; changed in place.
       workspace: see _Workspace.
       hyper: see _Hyperparameters.
@@ -184,10 +221,12 @@ def _updates(
     """
     size = len(workspace.td_target)
     for start in range(0, len(td_errors), size):
-        _td_targets(batch, start, online, target, workspace, hyper.double)
-        _forward(batch.s_tm1, start, online, workspace.online)
+        _td_targets(batch, start, online, target, pooling, workspace, hyper.double)
+        _forward_online(batch.s_tm1, start, online, pooling, workspace.online)
         _losses(batch, start, workspace, hyper.huber, td_errors, sums)
         _backward(batch.a_tm1, start, online, grads, workspace)
+        if pooling is not None:
+            _pooling_backward(online, pooling, workspace)
         updates, steps = updates + 1, steps + 1.0
         _adam_step(flat, hyper, learning_rate, steps)
         if hyper.target_rate > 0:
@@ -206,15 +245,36 @@ def _forward(states: Floats, start: int, layers: Layers, activations: tuple[Floa
 
 
 @inlined
+def _forward_online(
+    states: Floats, start: int, online: Layers, pooling: _Pooling | None, activations: tuple[Floats, ...]
+) -> None:
+    if pooling is None:
+        _forward(states, start, online, activations)
+    else:
+        encode_rows(states, start, pooling.online, pooling.encoder, activations[0])
+        forward(online, activations)
+
+
+@inlined
 def _td_targets(
-    batch: _SuperBatch, start: int, online: Layers, target: Layers, workspace: _Workspace, double: bool
+    batch: _SuperBatch,
+    start: int,
+    online: Layers,
+    target: Layers,
+    pooling: _Pooling | None,
+    workspace: _Workspace,
+    double: bool,
 ) -> None:
     """Writes the TD targets of a minibatch (see `learner.update.double_dqn.td_targets`)."""
-    _forward(batch.s_t, start, target, workspace.other)
+    if pooling is None:
+        _forward(batch.s_t, start, target, workspace.other)
+    else:
+        encode_rows(batch.s_t, start, pooling.target, pooling.encoder, workspace.other[0])
+        forward(target, workspace.other)
     q_t = workspace.other[-1]
     selector = q_t
     if double:
-        _forward(batch.s_t, start, online, workspace.online)
+        _forward_online(batch.s_t, start, online, pooling, workspace.online)
         selector = workspace.online[-1]
     for row in range(len(workspace.td_target)):
         best = best_action(selector, row)
@@ -261,6 +321,27 @@ def _backward(actions: NDArray[np.int64], start: int, online: Layers, grads: Lay
         if i > 0:
             multiply(delta, online.weights[i], workspace.other[i])
             _relu_backward(workspace.other[i], inputs)
+
+
+@inlined
+def _pooling_backward(online: Layers, pooling: _Pooling, workspace: _Workspace) -> None:
+    """Backpropagates to the shared layers: each unit's gradient goes to the row that had the maximum."""
+    encoder, grads, delta = pooling.encoder, pooling.grads, workspace.other[0]
+    if len(online.weights) > 1:  # else the head has written it
+        multiply(workspace.other[1], online.weights[0], delta)
+    count, columns = encoder.first[-1], encoder.rows.shape[1]
+    encoded, hidden = pooling.delta_encoded[:count], pooling.delta_hidden[:count]
+    encoded[:] = np.float32(0)
+    for i in range(encoder.winner.shape[0]):
+        for unit in range(encoder.winner.shape[1]):
+            if encoder.winner[i, unit] >= 0:
+                encoded[encoder.winner[i, unit], unit] = delta[i, columns + unit]
+    _sum_rows(encoded, grads.biases[1])
+    multiply(encoded.T, encoder.hidden[:count], grads.weights[1])
+    multiply(encoded, pooling.online.weights[1], hidden)
+    _relu_backward(hidden, encoder.hidden[:count])
+    _sum_rows(hidden, grads.biases[0])
+    multiply(hidden.T, encoder.rows[:count], grads.weights[0])
 
 
 @inlined

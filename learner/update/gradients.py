@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from actors.policy.network import DuelingNetwork, QNetwork, fold_dueling_head
+from actors.policy.network import DuelingNetwork, Network, fold_dueling_head
 from learner.update.double_dqn import Batch, LossName, mean_loss, td_targets
 
 Layer = tuple[Tensor, Tensor]
@@ -48,7 +48,7 @@ class FlatNetwork:
       grads: the gradients of each layer, as views.
     """
 
-    def __init__(self, network: QNetwork | DuelingNetwork) -> None:
+    def __init__(self, network: Network) -> None:
         parameters = list(network.parameters())
         flat = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])
         self.network = network

@@ -10,12 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from actors.policy.network import NETWORKS, snapshot
+from actors.policy.network import snapshot
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import EnvShape
 from learner.config import RunConfig
 from learner.update.compiled_updates import CompiledUpdates
 from learner.update.gradients import FlatNetwork
+from learner.update.networks import learning_network
 from learner.update.updates import TorchUpdates, Updates, UpdateStats
 from sim_core.checks import require
 
@@ -45,7 +46,7 @@ class Learner:
     def __init__(self, config: RunConfig, shape: EnvShape) -> None:
         with torch.random.fork_rng():
             torch.manual_seed(config.seed)
-            online = NETWORKS[config.network](shape.observation_size, config.hidden_sizes, shape.num_actions)
+            online = learning_network(config, shape)
         self.device = learning_device(config.device)
         self._online = FlatNetwork(online.to(self.device))
         self._target = self._online.copy()
@@ -55,7 +56,7 @@ class Learner:
         self.policy = self.online if self._average is None else self._average.network
         self.optimiser = torch.optim.Adam([self._online.values], fused=True)
         by_hand = config.gradients == "by_hand"
-        compilable = by_hand and config.network == "plain" and self.device.type == "cpu"
+        compilable = by_hand and config.network != "dueling" and self.device.type == "cpu"
         kind = CompiledUpdates if compilable else TorchUpdates
         self._make_updates: Updates = kind(self._online, self._target, self.optimiser, config)
         self.updates = 0

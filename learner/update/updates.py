@@ -56,7 +56,8 @@ class TorchUpdates:
     ) -> None:
         self._online, self._target, self._optimiser, self._config = online, target, optimiser, config
         double = config.algorithm == "double_dqn"
-        self._gradients = GRADIENTS[config.gradients](online, target, double, config.loss)
+        kind = "autograd" if config.network == "pooled" else config.gradients  # by hand only in compiled updates
+        self._gradients = GRADIENTS[kind](online, target, double, config.loss)
 
     def __call__(
         self, columns: dict[str, Tensor], learning_rate: float, updates: int

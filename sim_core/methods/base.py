@@ -124,8 +124,8 @@ class Method:
     """Whether the swarm avoids the learning robot and counts it in its flock, unless the world says otherwise."""
     timeout_fails: ClassVar[bool] = False
     """Whether a timeout is a terminal failure, unless the world says otherwise; else it cuts the episode."""
-    fits_any_groups: ClassVar[bool] = False
-    """Whether an observation has the same size for every number of groups, so that a policy can be tested there."""
+    row_size: ClassVar[int] = 0
+    """Elements of a row, where an observation is rows of groups, the own one first and absent ones zero; else 0."""
     draws: ClassVar[frozenset[str]] = frozenset()
     """What the player draws of the state: `sectors`, `ellipses`."""
     presets: ClassVar[Mapping[str, Preset]] = {}
@@ -147,6 +147,11 @@ class Method:
     def observation_names(cls, config: WorldConfig) -> tuple[str, ...]:
         """Names of an observation's elements, whose number is its size."""
         raise NotImplementedError(f"{cls.__name__} must define observation_names(cls, config)")
+
+    @classmethod
+    def max_groups(cls, config: WorldConfig) -> int:
+        """Most groups for which an observation has the size that it has in `config`, so that a policy fits there."""
+        return config.groups
 
     @classmethod
     def check(cls, config: WorldConfig) -> None:

@@ -112,6 +112,7 @@ def _perceive(state, mask, out, order, distance_sq, params):
         _order_groups(world, state, order, distance_sq, p)
         for row in range(p.groups):
             _write_row(order[row], world, state, out[world], row * p.columns, p)
+        out[world, p.groups * p.columns :] = np.float32(0)
 
 
 @kernel
@@ -182,8 +183,7 @@ class EllipseMethod(Method):
     timeout_fails = True
     draws = frozenset({"ellipses"})
     presets = ELLIPSE_PRESETS
-    columns: ClassVar[int] = ELLIPSE_COLUMNS
-    """Elements of a group's row."""
+    row_size: ClassVar[int] = ELLIPSE_COLUMNS
 
     observation_dtype = np.float32
 
@@ -201,7 +201,7 @@ class EllipseMethod(Method):
                 ellipse_scale=float(config.ellipse_scale_per_m),
                 goal_scale=float(config.goal_scale_per_m),
                 limit=self.observation_limit,
-                columns=self.columns,
+                columns=self.row_size,
                 field_of_all=config.apf_rows == "all",
                 episode=episode_params(config),
             )
@@ -210,8 +210,13 @@ class EllipseMethod(Method):
     @classmethod
     def observation_names(cls, config: WorldConfig) -> tuple[str, ...]:
         """A row a group, the own one first."""
-        rows = ("own group", *(f"other group {row}" for row in range(1, config.groups)))
-        return tuple(f"{row}, {name}" for row in rows for name in COLUMN_NAMES[: cls.columns])
+        rows = ("own group", *(f"other group {row}" for row in range(1, max(config.groups, config.group_rows))))
+        return tuple(f"{row}, {name}" for row in rows for name in COLUMN_NAMES[: cls.row_size])
+
+    @classmethod
+    def max_groups(cls, config: WorldConfig) -> int:
+        """The rows of the state."""
+        return max(config.groups, config.group_rows)
 
     @classmethod
     def check(cls, config: WorldConfig) -> None:
@@ -235,7 +240,7 @@ class EllipseMethod(Method):
         return {"greedy": act}
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.float32]) -> None:
-        """4.2.1: the state matrix `[num_worlds, groups * columns]`, row after row."""
+        """4.2.1: the state matrix `[num_worlds, rows * row_size]`, row after row."""
         _perceive(state, mask, out, self._order, self._distance_sq, self._params)
 
     def outcome(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:

@@ -18,7 +18,7 @@ class InsideMethod(EllipseMethod):
 
     label = "M_IN"
     robot_module = "learner.export.ellipse_methods:InsideRobot"
-    columns = ELLIPSE_COLUMNS + FIELD_COLUMNS
+    row_size = ELLIPSE_COLUMNS + FIELD_COLUMNS
 
     @classmethod
     def rules(cls, config: WorldConfig) -> dict[str, Rule]:
@@ -31,7 +31,7 @@ class InsideMethod(EllipseMethod):
         every_row_holds_all = config.apf_rows == "all"
 
         def field(observation: NDArray[Any]) -> NDArray[np.int64]:
-            rows = observation.reshape(len(observation), -1, cls.columns).astype(np.float64)
+            rows = observation.reshape(len(observation), -1, cls.row_size).astype(np.float64)
             centre = rows[:, 0, 2:4] / config.ellipse_scale_per_m
             length = np.linalg.norm(centre, axis=1, keepdims=True)
             attraction = centre * np.minimum(1.0, config.learner_speed_m_s / np.maximum(length, 1e-9))

@@ -143,6 +143,17 @@ def test_a_resumed_run_of_several_setups_is_the_uninterrupted_one(small, tmp_pat
     assert_same(final_state(tmp_path / "whole"), halves)
 
 
+def test_a_resumed_run_of_a_pooled_network_is_the_uninterrupted_one(small, tmp_path):
+    world = dataclasses.replace(small.world, method="out", robots=3, groups=2, group_rows=5)
+    whole = dataclasses.replace(small, world=world, setups=("3x2", "4x5"), network="pooled", hidden_sizes=(16, 16))
+    train(whole, tmp_path / "whole")
+    train(dataclasses.replace(whole, total_env_steps=3_072), tmp_path / "halves")
+    train(whole, tmp_path / "halves")
+    halves = final_state(tmp_path / "halves")
+    assert "learner/online.rows.0.weight" in halves[0]
+    assert_same(final_state(tmp_path / "whole"), halves)
+
+
 @pytest.mark.parametrize("shards", [1, 3])
 def test_a_resumed_run_with_every_option_is_the_uninterrupted_one(small, tmp_path, shards):
     whole = dataclasses.replace(small, replay_shards=shards, workers=2, replay_capacity=4_200, **OPTIONS)

@@ -63,6 +63,9 @@ def test_values_out_of_range_are_refused(name, values):
             RunConfig(**{name: value})
 
 
+OTHER = WorldConfig(method="in")
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
@@ -79,7 +82,12 @@ def test_values_out_of_range_are_refused(name, values):
         ({"setups": ("1x2",)}, "robots must be at least 2"),
         ({"setups": ("10x2",), "env_id": "CartPole-v1"}, "setups are those of our own environment, not of CartPole"),
         ({"setups": ("all",), "envs_per_worker": 24}, r"envs_per_worker \(24\) must be at least .* setups \(25\)"),
-        ({"setups": ("5x2", "5x4"), "world": WorldConfig(method="in")}, r"have groups = 2, not \[2, 4\]: .* method in"),
+        (
+            {"setups": ("5x2", "5x4"), "world": WorldConfig(method="in")},
+            r"equally many groups, not \[2, 4\]: .*group_rows = 4",
+        ),
+        ({"network": "pooled"}, "network must be plain or dueling for sensor 10r×2g"),
+        ({"network": "pooled", "env_id": "CartPole-v1"}, "network must be plain or dueling for CartPole-v1"),
         ({"setups": "all"}, "setups must be a list of texts such as 10x2, not 'all'"),
     ],
 )

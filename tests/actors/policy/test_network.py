@@ -6,14 +6,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.policy.network import NETWORKS, DuelingNetwork, QNetwork, load_snapshot, snapshot
+from actors.policy import network as networks
+from actors.policy.network import DuelingNetwork, PooledNetwork, QNetwork, load_snapshot, snapshot
 from actors.policy.policy import Policy, WeightsSnapshot
 
 
 def make_network(size, hidden_sizes, num_actions, seed=0, kind="plain"):
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        return NETWORKS[kind](size, hidden_sizes, num_actions)
+        return networks.make_network(kind, size, hidden_sizes, num_actions)
 
 
 def observations(shape, dtype, seed=0, batch=7):
@@ -40,6 +41,45 @@ def test_the_policy_computes_the_same_values_as_the_network(shape, dtype, hidden
     assert values.dtype == np.float32 and values.shape == (7, num_actions)
     np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-5)
     np.testing.assert_array_equal(policy.greedy(observation), values.argmax(axis=1))
+
+
+def rows_of_groups(rows, row_size, batch=9, seed=0):
+    """Observations `[batch, rows * row_size]` with between 0 and all other rows, and how many rows each has."""
+    rng = np.random.default_rng(seed)
+    values = rng.normal(scale=2, size=(batch, rows, row_size)).astype(np.float32)
+    present = rng.integers(1, rows + 1, size=batch)
+    values[np.arange(rows) >= present[:, None]] = 0.0
+    return values, present
+
+
+@given(
+    rows=st.integers(1, 16),
+    row_size=st.integers(1, 9),
+    hidden_sizes=st.lists(st.integers(1, 20), min_size=1, max_size=3).map(tuple),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=60, deadline=None)
+def test_a_pooled_policy_computes_the_same_values_as_its_network(rows, row_size, hidden_sizes, seed):
+    torch.manual_seed(seed)
+    network = PooledNetwork(rows * row_size, hidden_sizes, 5, row_size)
+    values, present = rows_of_groups(rows, row_size, seed=seed)
+    policy, rng = Policy(snapshot(network, 0, 0.0)), np.random.default_rng(seed)
+    found = policy.values(values.reshape(9, -1))
+    with torch.no_grad():
+        np.testing.assert_allclose(found, network(torch.from_numpy(values.reshape(9, -1))), rtol=1e-4, atol=1e-5)
+        loaded = PooledNetwork(rows * row_size, hidden_sizes, 5, row_size)
+        load_snapshot(loaded, policy.weights)
+        assert torch.equal(loaded(torch.from_numpy(values)), network(torch.from_numpy(values)))
+    for i in range(len(present)):  # neither the order of the other groups nor the places of absent ones count
+        values[i, 1:] = values[i, 1 + rng.permutation(rows - 1)]
+    np.testing.assert_allclose(policy.values(values.reshape(9, -1)), found, rtol=1e-4, atol=1e-5)
+
+
+def test_nan_weights_give_nan_values_of_a_pooled_network_too():
+    network = PooledNetwork(12, (4, 5), 3, 4)
+    with torch.no_grad():
+        network.rows[0].weight.fill_(torch.nan)
+    assert np.isnan(Policy(snapshot(network, 0, 0.0)).values(np.ones((2, 12)))).all()
 
 
 def test_relu_follows_every_layer_but_the_last():

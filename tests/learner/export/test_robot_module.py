@@ -28,6 +28,7 @@ WORLDS = {
     "in, full, nearest": WorldConfig(
         method="in", robots=6, groups=4, ellipse_covariance="full", group_order="nearest", apf_range_m=1.5
     ),
+    "in, rows for more groups": WorldConfig(method="in", robots=5, groups=3, group_rows=7),
     "in, all, printed": WorldConfig(method="in", robots=6, groups=2, apf_rows="all", ellipse_axes="printed"),
 }
 

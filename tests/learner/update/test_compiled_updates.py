@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from actors.policy.network import QNetwork
+from actors.policy.network import PooledNetwork, QNetwork
 from learner.update.compiled_updates import CompiledUpdates
 from learner.update.gradients import FlatNetwork
 from learner.update.updates import TorchUpdates
+from sim_core.config import WorldConfig
 
+ROWS = [(5, 9, (16, 12)), (8, 7, (24, 32, 8)), (3, 4, (6,)), (1, 7, (8, 8))]
+"""Rows of an observation, their elements, hidden sizes."""
 SHAPES = [((16,), (64, 64), 8, 64), ((72,), (256, 256), 9, 32), ((3,), (5,), 2, 1), ((2, 4), (7, 6, 5), 4, 33)]
 RATE = 1e-3
 SOFT = {"target_update": "soft", "target_update_rate": 0.1}
@@ -23,6 +26,49 @@ def maker(ways, config, shape, num_actions):
     online, target = FlatNetwork(QNetwork(*sizes)), FlatNetwork(QNetwork(*sizes))
     optimiser = torch.optim.Adam([online.values], fused=True)
     return ways(online, target, optimiser, config), online, target, optimiser
+
+
+def pooled_maker(ways, config, rows, row_size):
+    """As `maker`, with a pooled network of 6 actions."""
+    torch.manual_seed(0)
+    networks = [PooledNetwork(rows * row_size, config.hidden_sizes, 6, row_size) for _ in range(2)]
+    online, target = map(FlatNetwork, networks)
+    optimiser = torch.optim.Adam([online.values], fused=True)
+    return ways(online, target, optimiser, config), online, target, optimiser
+
+
+def with_absent_rows(columns, rows, row_size, most):
+    """The columns, in whose observations up to `most` rows are zeros."""
+    rng = np.random.default_rng(3)
+    for name in ("observation", "next_observation"):
+        present = rng.integers(max(1, rows - most), rows + 1, size=len(columns[name]))
+        tensor = columns[name].reshape(-1, rows, row_size)
+        tensor[torch.from_numpy(np.arange(rows) >= present[:, None])] = 0.0
+    return columns
+
+
+@pytest.mark.parametrize("most", [0, 8])
+@pytest.mark.parametrize("options", [{}, {"loss": "mse"} | SOFT, {"algorithm": "dqn"}])
+@pytest.mark.parametrize(("rows", "row_size", "hidden_sizes"), ROWS)
+def test_an_update_of_a_pooled_network_equals_that_of_autograd(
+    learner_config, rows, row_size, hidden_sizes, options, most
+):
+    settings = {"hidden_sizes": hidden_sizes, "batch_size": 24} | options
+    config = dataclasses.replace(learner_config, **settings, network="pooled", world=WorldConfig(method="in"))
+    compiled, online, target, _ = pooled_maker(CompiledUpdates, config, rows, row_size)
+    plain, other_online, other_target, _ = pooled_maker(TorchUpdates, config, rows, row_size)
+    columns = with_absent_rows(columns_of(5 * 24, (rows * row_size,), 6), rows, row_size, most)
+    stats, errors = compiled(columns, RATE, 7)
+    expected, expected_errors = plain(columns, RATE, 7)
+    np.testing.assert_allclose(stats, expected, rtol=2e-5, atol=2e-6)
+    np.testing.assert_allclose(errors, expected_errors, rtol=2e-5, atol=2e-5)
+    scale = float(other_online.values.grad.abs().max())
+    torch.testing.assert_close(online.values.grad, other_online.values.grad, rtol=1e-3, atol=1e-5 * scale)
+    shared = sum(tensor.numel() for tensor in (*online.layers[0], *online.layers[1]))
+    assert bool(online.values.grad[:shared].abs().max() > 1e-3 * scale) == (rows > 1)
+    for flat, other in ((online, other_online), (target, other_target)):
+        apart = (flat.values - other.values).detach().abs().mean()
+        assert float(apart) < 2e-3 * RATE
 
 
 def columns_of(count, shape, num_actions, seed=0, weighted=False):

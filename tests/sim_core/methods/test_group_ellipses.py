@@ -1,11 +1,13 @@
 """M_IN and M_OUT: the state matrix by hand and by numpy, Table 4.1, phi and the outcomes step by step."""
 
+import dataclasses
 import itertools
 import math
 
 import numpy as np
 import pytest
 
+from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 from sim_core.methods import make_method
 from sim_core.methods.apf import field_params, repulsion
@@ -168,6 +170,23 @@ def scene(make_state, at, others, method="out", **settings):
     """(config, state): the learning robot at `at`, its four mates on a square around (0, 0), five robots `others`."""
     config = WorldConfig(**({"method": method, "robots": 5, "groups": 2} | settings))
     return config, make_state(config, [at, *SQUARE, *others], [FAR, FAR], learner=0)
+
+
+@pytest.mark.parametrize("method", METHOD_NAMES)
+def test_rows_without_a_group_are_zeros(method, make_state):
+    rng = np.random.default_rng(4)
+    config = WorldConfig(method=method, robots=4, groups=3)
+    padded = dataclasses.replace(config, group_rows=8)
+    state = make_state(config, rng.normal(size=(12, 2)), rng.normal(size=(3, 2)), learner=5)
+    rows = make_method(padded)
+    out = np.full((1, *rows.observation_shape), 99, rows.observation_dtype)
+    rows.perceive(state, ALL, out)
+    seen = out[0].reshape(8, -1)
+    np.testing.assert_array_equal(seen[:3], observe(config, state))
+    assert (seen[3:] == 0).all() and (seen[:3, 0] > 0).all(), "an absent row is told by its half-axis"
+    assert len(rows.observation_names(padded)) == out.size
+    with pytest.raises(ConfigError, match="group_rows must be 0 or at least groups \\(3\\), not 2"):
+        dataclasses.replace(config, group_rows=2)
 
 
 AWAY = [(20, 20 + i) for i in range(5)]
