@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from sim_core.scenes.base import Scene
 
 MAX_HEADINGS = 64
+MAX_HISTORY = 16
 MAX_ROBOTS = 100_000
 """Most robots of one world."""
 
@@ -49,6 +50,8 @@ class WorldConfig:
     """q, the number of sectors per sensing region and of headings (not given in the text)."""
     sector_frame: Literal["world", "goal"] = "world"
     """`sensor`: angle 0 of sectors and headings is the world's +x axis (Eq. 3.3), or points to the own goal (ours)."""
+    history: int = 1
+    """Observations that the policy sees: the present one and those before the last decisions (ours; 1 in the text)."""
     stop_action: bool = False
     """Adds an action that keeps the learning robot where it is (ours; the text has headings only)."""
     inner_radius_m: float = 0.5
@@ -279,6 +282,7 @@ def _check_counts(config: WorldConfig) -> None:
         f"decision_interval_steps must be between 1 and horizon_steps ({config.horizon_steps}), not "
         f"{config.decision_interval_steps}",
     )
+    require(1 <= config.history <= MAX_HISTORY, f"history must be between 1 and {MAX_HISTORY}, not {config.history}")
     require(
         config.outside_limit_steps >= 1, f"outside_limit_steps must be at least 1, not {config.outside_limit_steps}"
     )

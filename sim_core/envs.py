@@ -47,10 +47,10 @@ def make_config(settings: dict[str, Any]) -> WorldConfig:
 
 
 def observation_space(config: WorldConfig) -> gym.spaces.Box:
-    """The method's observations of one world."""
+    """What the policy sees of one world: the method's observations, of the last `history` decisions."""
     method = make_method(config)
-    limit = method.observation_limit
-    return gym.spaces.Box(-limit, limit, method.observation_shape, method.observation_dtype)
+    limit, (size,) = method.observation_limit, method.observation_shape
+    return gym.spaces.Box(-limit, limit, (size * config.history,), method.observation_dtype)
 
 
 def _check_render_mode(render_mode: str | None) -> None:

@@ -69,6 +69,7 @@ class WorldBatch:
         self._command_x = np.zeros(num_worlds, np.float32)
         self._command_y = np.zeros(num_worlds, np.float32)
         self._observation = np.zeros((num_worlds, *self.method.observation_shape), self.method.observation_dtype)
+        self._history = np.zeros((num_worlds, config.history, *self.method.observation_shape), self._observation.dtype)
         self._reward = np.zeros(num_worlds, np.float32)
         self.step_reward = np.zeros(num_worlds, np.float32)
         self._running = np.zeros(num_worlds, np.bool_)
@@ -96,7 +97,21 @@ class WorldBatch:
         self.scene.start(self.state, mask)
         reset_episode(self.state, mask)
         self.method.perceive(self.state, mask, self._observation)
-        return self._observation.copy()
+        if self.config.history > 1:
+            self._history[mask] = self._observation[mask, None]
+        return self.observation()
+
+    def observation(self) -> NDArray[Any]:
+        """What the policy sees `[num_worlds, size]`, a copy: with a history, the newest observation first.
+
+        Where an observation is rows of groups, the row of a group holds its elements of all these observations.
+        """
+        if self.config.history == 1:
+            return self._observation.copy()
+        frames, rows = self._history, self.method.row_size
+        if rows:
+            frames = frames.reshape(self.num_worlds, self.config.history, -1, rows).swapaxes(1, 2)
+        return frames.reshape(self.num_worlds, -1).copy()
 
     def step(self, action: NDArray[np.int64] | Pilot, watch: Callable[[], None] | None = None) -> StepResult:
         """Takes one decision in every world: `decision_interval_steps` simulator steps with the same action.
@@ -122,14 +137,20 @@ class WorldBatch:
                 watch()
             if left and not self._running.any():
                 break
-        self.method.perceive(self.state, self._all, self._observation)
+        self._perceive()
         return StepResult(
-            self._observation.copy(),
+            self.observation(),
             self._reward.copy(),
             self._outcome.copy(),
             self.state.steps.copy(),
             self.state.episode_return.copy(),
         )
+
+    def _perceive(self) -> None:
+        self.method.perceive(self.state, self._all, self._observation)
+        if self.config.history > 1:
+            self._history[:, 1:] = self._history[:, :-1].copy()
+            self._history[:, 0] = self._observation
 
     def _simulate(self, action: NDArray[np.int64] | Pilot) -> None:
         """Moves the running worlds by one simulator step and adds its rewards."""
@@ -171,7 +192,8 @@ class WorldBatch:
 
     def _changing(self) -> dict[str, NDArray[Any]]:
         """The arrays that steps change."""
-        return {name: array for name, array in self.state._asdict().items() if name not in CONSTANT}
+        changing = {name: array for name, array in self.state._asdict().items() if name not in CONSTANT}
+        return changing | ({"history": self._history} if self.config.history > 1 else {})
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Copies of all arrays that a checkpoint needs, by name."""
@@ -191,7 +213,7 @@ class WorldBatch:
         for name, array in arrays.items():
             array[...] = saved[name]
         self.method.perceive(self.state, self._all, self._observation)
-        return self._observation.copy()
+        return self.observation()
 
 
 REHEARSAL_WORLDS, REHEARSAL_STEPS = 16, 20

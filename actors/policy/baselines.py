@@ -80,9 +80,14 @@ class MethodRule:
     def __init__(self, config: WorldConfig, baseline: Baseline) -> None:
         check_exists(baseline, config)
         self._rule = config.method_class.rules(config)[baseline]
+        self._history, self._row_size = config.history, config.method_class.row_size
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.int64]:
-        """Actions `[batch]` for observations `[batch, *shape]`."""
+        """Actions `[batch]` for observations `[batch, *shape]`; of a history the rule sees the newest."""
+        if self._history > 1:
+            width = self._row_size or observation.shape[1] // self._history
+            rows = observation.reshape(len(observation), -1, self._history * width)
+            observation = rows[:, :, :width].reshape(len(observation), -1)
         return self._rule(observation)
 
 

@@ -36,7 +36,7 @@ class EnvSpec(NamedTuple):
     @property
     def row_size(self) -> int:
         """Elements of a row, where an observation is rows of groups; else 0."""
-        return self.world.method_class.row_size if self.is_swarm else 0
+        return self.world.method_class.row_size * self.world.history if self.is_swarm else 0
 
     def of_setup(self, world: WorldConfig) -> EnvSpec:
         """The environment of one setup alone."""

@@ -81,7 +81,7 @@ def _exportable(command: Export, config: RunConfig, weights: WeightsSnapshot) ->
     if command.bare:
         states = observed_states(config.env, weights, command.first_seed, command.states)
         world = config.world
-        names = world.method_class.observation_names(world) if config.env.is_swarm else ()
+        names = world.method_class.observation_names(world) if config.env.is_swarm and world.history == 1 else ()
         return _Exportable(BarePolicy(network), bare_inputs(shape, names), bare_outputs(shape), states)
     world = config.world
     states = swarm_states(world, weights, weights, command.first_seed, command.states)
@@ -116,6 +116,11 @@ def run(command: Export) -> int:
         command.bare or config.world.sector_frame == "world",
         "a robot's export takes positions in the world's frame, but this policy was trained with sector_frame = goal; "
         "export observation to action values with --bare True",
+    )
+    require(
+        command.bare or config.world.history == 1,
+        f"a robot's export decides on what the robot senses now, but this policy was trained with history = "
+        f"{config.world.history}; export observation to action values with --bare True",
     )
     require(
         config.env.is_swarm or command.bare,

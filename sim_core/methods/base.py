@@ -228,6 +228,7 @@ class CheckedMethod(Method):
         self.observation_shape = self._method.observation_shape
         self.observation_dtype = np.dtype(self._method.observation_dtype)
         self.observation_limit = float(self._method.observation_limit)
+        self.row_size = self._cls.row_size  # type: ignore[misc]  # of the user's class, here of an instance
         self._is_float = np.issubdtype(self.observation_dtype, np.floating)
         self._top_speed_m_s = config.top_speed_m_s
 

@@ -229,6 +229,35 @@ def test_a_decision_is_so_many_steps_with_one_action(method, settings, interval)
     assert ended.sum() > 5 and (slow.state.steps[ended] % interval).any()
 
 
+@pytest.mark.parametrize(("method", "columns"), [("sensor", 16), ("in", 9), ("out", 7)])
+def test_a_history_holds_the_last_observations_the_newest_first(method, columns):
+    settings = {"method": method, "horizon_steps": 40, "groups": 3}
+    plain, seeing = batch(SEEDS, **settings), batch(SEEDS, **settings, history=3)
+    frames = [plain.observation()] * 3
+
+    def stacked():
+        rows = [frame.reshape(8, -1, columns) for frame in reversed(frames[-3:])]
+        return np.concatenate(rows, axis=2).reshape(8, -1)
+
+    np.testing.assert_array_equal(seeing.observation(), stacked())
+    ended = 0
+    for action in actions(100, 8, seed=4):
+        result, expected = seeing.step(action), plain.step(action)
+        frames.append(expected.observation)
+        np.testing.assert_array_equal(result.observation, stacked())
+        done = is_done(result.outcome)
+        if done.any():
+            first = plain.reset(done)
+            for frame in frames[-3:]:
+                frame[done] = first[done]
+            np.testing.assert_array_equal(seeing.reset(done), stacked())
+            saved, ended = seeing.get_state(), ended + 1
+    assert ended > 1
+    other = batch(SEEDS, **settings, history=3)
+    np.testing.assert_array_equal(other.set_state(seeing.get_state()), seeing.observation())
+    assert "history" in saved and "history" not in plain.get_state()
+
+
 def test_what_is_terminal():
     every = np.array(list(Outcome), np.int8)
     names = {Outcome.GOAL, Outcome.LOST, Outcome.CAPTURED, Outcome.COLLISION}

@@ -1,5 +1,6 @@
 """Baselines: hand-made observations, FL-ORCA by hand, and randomness that no batching changes."""
 
+import dataclasses
 import math
 import pickle
 
@@ -124,6 +125,18 @@ def test_field_takes_the_action_nearest_to_attraction_and_repulsion(settings):
         assert error[chosen[world]] <= error.min() + 1e-5
         repelled += bool(near.any())
     assert repelled > 20
+
+
+@pytest.mark.parametrize("method", ["sensor", "in", "out"])
+def test_a_rule_sees_the_newest_of_a_history(method):
+    plain = WorldBatch(WorldConfig(method=method, robots=4, groups=2), 30)
+    seeing = WorldBatch(dataclasses.replace(plain.config, history=3), 30)
+    first, second = plain.reset(), seeing.reset()
+    rules = [MethodRule(worlds.config, Baseline.GREEDY) for worlds in (plain, seeing)]
+    for _ in range(40):
+        action = rules[0].act(first)
+        np.testing.assert_array_equal(rules[1].act(second), action)
+        first, second = plain.step(action).observation, seeing.step(action).observation
 
 
 def test_a_rule_that_a_method_lacks_is_refused():
