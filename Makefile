@@ -10,7 +10,7 @@ INSTALL := $(PIP) --constraint .ci/constraints.txt --editable
 # Python compiles the modules that it imports, once. pip would compile all, which takes longer than a first training saves.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: train test lint style types kernels constraints bench bench-peers bench-exactness reproduce fuzz soak setup clean
+.PHONY: train test lint style types kernels constraints bench bench-peers bench-exactness reproduce generalist fuzz soak setup clean
 
 setup: $(READY)
 
@@ -80,6 +80,11 @@ bench-exactness: $(READY)
 # Three cells of the committed results, trained anew: do they land where those are? ARGS="--cells 10 --seed 1" for others.
 reproduce: $(READY)
 	$(BIN)/python -m tests.benchmarks.reproduce $(ARGS)
+
+# One policy for all setups beside the rules, on the same start scenes: trainings of minutes, three seeds a method.
+# ARGS="--methods sensor --seeds 0" for one.
+generalist: $(READY)
+	$(BIN)/python -m tests.benchmarks.generalist $(ARGS)
 
 # Over ten thousand random command lines and config files. ARGS="--share 0.1" for some, ARGS="--seed 1" for others.
 fuzz: $(READY)

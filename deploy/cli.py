@@ -27,7 +27,7 @@ from actors.service.fault_policy import RunFailed  # noqa: E402
 from deploy.options.results import Dashboard, Evaluate, Export, Report, Watch  # noqa: E402
 from deploy.options.training import Chaos, Resume, Submit, Sweep, Train, ray_address  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
-from learner.presets import PresetName, preset_config  # noqa: E402
+from learner.presets import TrainingPreset, preset_config  # noqa: E402
 from learner.ray_backend.auth import guard_ray  # noqa: E402
 from sim_core.checks import ConfigError, require, require_packages  # noqa: E402
 
@@ -89,8 +89,8 @@ def _train_defaults(arguments: Sequence[str]) -> Train:
     if path is not None:
         require(preset is None, "--config and --preset both give all settings; leave one of them out")
         return Train(config=Path(path), run=read_config_file(Path(path)))
-    if preset in get_args(PresetName):  # else tyro tells the choices
-        return Train(run=preset_config(cast(PresetName, preset), method or "sensor"))
+    if preset in get_args(TrainingPreset):  # else tyro tells the choices
+        return Train(run=preset_config(cast(TrainingPreset, preset), method or "sensor"))
     return Train()
 
 

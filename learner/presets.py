@@ -11,12 +11,16 @@ the robots' size: those are calibrated on seeds that no evaluation uses (README 
 - M_IN and M_OUT: all robots of a group span its ellipse, as the text has it; the sum u_nn + u_apf may be faster than
   u_nn, as the text bounds neither.
 
-`best` plays in the same worlds, with the same actions and ends of episodes, and knows of other robots what the method
-knows. It learns from three steps and more samples, and
+`best` plays in the same worlds, with the same robots, swarm and ends of episodes, and knows of other robots what the
+method knows. One decision lasts several simulator steps: at 0.05 s one action changes hardly anything, so the values of
+two actions differ by less than the network's error. It learns from three decisions at a time and from more samples with
+a smaller rate, and
 
 - M_sensor counts own and other robots apart: their difference hides a crowd of both;
 - M_IN and M_OUT are rewarded for progress towards the goal inside the ellipse, not for being inside: with few robots
   the learning robot can hardly leave an ellipse that it spans, and lingers.
+
+`generalist` is `best` for one policy that learns all setups of the dissertation at once.
 
 What a preset sets for one method alone stands with the method (`Method.presets`).
 """
@@ -30,6 +34,9 @@ from sim_core.config import WorldConfig
 from sim_core.plugins import METHODS, find
 
 PresetName = Literal["thesis", "best"]
+"""Presets of one setup, those of sweeps."""
+TrainingPreset = Literal["thesis", "best", "generalist"]
+"""Presets of one training."""
 
 _COMMON: dict[str, Any] = {
     "total_env_steps": 1_000_000,
@@ -44,7 +51,33 @@ _COMMON: dict[str, Any] = {
 }
 
 
-def preset_config(name: PresetName, method: str, robots: int = 10, groups: int = 2) -> RunConfig:
+_BEST: dict[str, Any] = {
+    "total_env_steps": 500_000,
+    "learning_rate": 3e-4,
+    "learning_rate_end": 2e-5,
+    "learning_rate_decay_env_steps": 500_000,
+    "epsilon_decay_env_steps": 100_000,
+    "replay_capacity": 500_000,
+    "samples_per_insert": 8.0,
+    "n_step": 3,
+    "eval_every_env_steps": 100_000,
+    "checkpoint_every_env_steps": 100_000,
+}
+_GENERALIST: dict[str, Any] = {
+    "setups": ("all",),
+    "envs_per_worker": 200,
+    "total_env_steps": 2_000_000,
+    "learning_rate_decay_env_steps": 2_000_000,
+    "epsilon_decay_env_steps": 200_000,
+    "replay_capacity": 1_000_000,
+    "eval_every_env_steps": 200_000,
+    "eval_episodes": 500,
+    "checkpoint_every_env_steps": 500_000,
+}
+_TRAINING = {"thesis": _COMMON, "best": _COMMON | _BEST, "generalist": _COMMON | _BEST | _GENERALIST}
+
+
+def preset_config(name: TrainingPreset, method: str, robots: int = 10, groups: int = 2) -> RunConfig:
     """The settings that a preset gives one method in one setup; a method without presets takes M_sensor's.
 
     Args:
@@ -58,4 +91,5 @@ def preset_config(name: PresetName, method: str, robots: int = 10, groups: int =
     """
     presets = find(METHODS, method).presets or find(METHODS, "sensor").presets
     training, world = presets[name]
-    return RunConfig(world=WorldConfig(method=method, robots=robots, groups=groups, **world), **_COMMON, **training)
+    chosen = WorldConfig(method=method, robots=robots, groups=groups, **world)
+    return RunConfig(world=chosen, **(_TRAINING[name] | training))

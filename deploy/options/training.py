@@ -11,7 +11,7 @@ from tyro.conf import Fixed, Positional, Suppress
 
 from learner.cluster_options import DEADLINE_S, START_DEADLINE_S, ClusterOptions
 from learner.config import RunConfig
-from learner.presets import PresetName
+from learner.presets import TrainingPreset
 from learner.sweep.grid import SweepConfig
 from sim_core.checks import require
 
@@ -78,8 +78,8 @@ class Train:
 
     config: Path | None = None
     """TOML file with settings; flags override it. World settings are under [world]."""
-    preset: PresetName | None = None
-    """Named settings of --method in place of the defaults, those of `shoal sweep`; flags override them."""
+    preset: TrainingPreset | None = None
+    """Named settings of --method in place of the defaults: those of `shoal sweep`, or of one policy for all setups."""
     or_resume: bool = False
     """Resume the run of this --name if it exists; it must have the same settings. Needs --name."""
     run: RunConfig = field(default_factory=RunConfig)

@@ -26,6 +26,12 @@ COUNT_LIMIT = 127
 """Counts saturate here, so that they fit int8."""
 WORLD: dict[str, Any] = {"max_neighbours": 16, "orca_radius_m": 0.18, "robot_radius_m": 0.06}
 """The world of the presets (see `learner.presets`)."""
+BEST_WORLD: dict[str, Any] = {
+    **WORLD,
+    "sensor_counts": "separate",
+    "decision_interval_steps": 4,
+    "horizon_is": "failure",
+}
 
 
 class SensorParams(NamedTuple):
@@ -107,7 +113,8 @@ class SensorMethod(Method):
     draws = frozenset({"sectors"})
     presets = {
         "thesis": Preset({"n_step": 1, "samples_per_insert": 1.5}, WORLD),
-        "best": Preset({"n_step": 3, "samples_per_insert": 3.0}, {**WORLD, "sensor_counts": "separate"}),
+        "best": Preset({"discount": 0.97}, BEST_WORLD),
+        "generalist": Preset({"discount": 0.97}, BEST_WORLD),
     }
     robot_module = "learner.export.m_sensor:SensorRobot"
 
