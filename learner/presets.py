@@ -51,30 +51,22 @@ _COMMON: dict[str, Any] = {
 }
 
 
-_BEST: dict[str, Any] = {
-    "total_env_steps": 500_000,
-    "learning_rate": 3e-4,
-    "learning_rate_end": 2e-5,
-    "learning_rate_decay_env_steps": 500_000,
-    "epsilon_decay_env_steps": 100_000,
-    "replay_capacity": 500_000,
-    "samples_per_insert": 8.0,
-    "n_step": 3,
-    "eval_every_env_steps": 100_000,
-    "checkpoint_every_env_steps": 100_000,
-}
 _GENERALIST: dict[str, Any] = {
+    **_COMMON,
     "setups": ("all",),
     "envs_per_worker": 200,
     "total_env_steps": 2_000_000,
+    "n_step": 3,
+    "samples_per_insert": 8.0,
+    "learning_rate": 3e-4,
+    "learning_rate_end": 2e-5,
     "learning_rate_decay_env_steps": 2_000_000,
-    "epsilon_decay_env_steps": 200_000,
     "replay_capacity": 1_000_000,
     "eval_every_env_steps": 200_000,
     "eval_episodes": 500,
     "checkpoint_every_env_steps": 500_000,
 }
-_TRAINING = {"thesis": _COMMON, "best": _COMMON | _BEST, "generalist": _COMMON | _BEST | _GENERALIST}
+_TRAINING = {"thesis": _COMMON, "best": _COMMON, "generalist": _GENERALIST}
 
 
 def preset_config(name: TrainingPreset, method: str, robots: int = 10, groups: int = 2) -> RunConfig:

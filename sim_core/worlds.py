@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_core.config import WorldConfig
+from sim_core.jit import kernel
 from sim_core.methods import make_method
 from sim_core.outcomes import Outcome
 from sim_core.packed import packed
@@ -20,7 +21,19 @@ from sim_core.state import CONSTANT, WorldState, empty_state
 from sim_core.swarm.step import advance, reset_episode, swarm_params
 from sim_core.swarm.tile import world_tile
 
-_RUNNING = np.int8(Outcome.RUNNING)
+_RUNNING = int(Outcome.RUNNING)
+
+
+@kernel
+def _end_step(running: Any, outcome: Any, step_reward: Any, reward: Any) -> Any:
+    """Adds the rewards of the worlds that were running, and stops those that have ended; whether any still runs."""
+    any_running = False
+    for world in range(running.shape[0]):
+        if running[world]:
+            reward[world] += step_reward[world]
+            running[world] = outcome[world] == _RUNNING
+            any_running |= running[world]
+    return any_running
 
 
 class Pilot(enum.Enum):
@@ -130,12 +143,13 @@ class WorldBatch:
         """
         if action is Pilot.SNAPPED:
             action = self.actions_nearest_to_swarm()
-        self._running[:], self._reward[:] = True, 0.0
+        self._running.fill(True)
+        self._reward.fill(0.0)
         for left in range(self.config.decision_interval_steps - 1, -1, -1):
-            self._simulate(action)
+            any_running = self._simulate(action)
             if watch is not None:
                 watch()
-            if left and not self._running.any():
+            if left and not any_running:
                 break
         self._perceive()
         return StepResult(
@@ -152,8 +166,8 @@ class WorldBatch:
             self._history[:, 1:] = self._history[:, :-1].copy()
             self._history[:, 0] = self._observation
 
-    def _simulate(self, action: NDArray[np.int64] | Pilot) -> None:
-        """Moves the running worlds by one simulator step and adds its rewards."""
+    def _simulate(self, action: NDArray[np.int64] | Pilot) -> bool:
+        """Moves the running worlds by one simulator step and adds its rewards; returns whether any still runs."""
         state, running, command = self.state, self._running, (self._command_x, self._command_y)
         if isinstance(action, Pilot):
             advance(state, self.tile, running, *command, False, self.swarm)
@@ -162,8 +176,7 @@ class WorldBatch:
             advance(state, self.tile, running, *command, True, self.swarm)
         self.method.outcome(state, running, self._outcome)
         self.method.reward(state, running, self._outcome, self.step_reward)
-        np.add(self._reward, self.step_reward, out=self._reward, where=running)
-        np.logical_and(running, self._outcome == _RUNNING, out=running)
+        return bool(_end_step(running, self._outcome, self.step_reward, self._reward))
 
     def actions_nearest_to_swarm(self) -> NDArray[np.int64]:
         """The actions `[num_worlds]` whose velocities are nearest to those that FL-ORCA has for the learning robots."""

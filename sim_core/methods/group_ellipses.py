@@ -167,9 +167,13 @@ COLUMN_NAMES = ("a", "b", "x_c", "y_c", "theta", "x_g", "y_g", "u_apf_x", "u_apf
 """Elements of a group's row; `a` and `b` are the smaller and the larger half-axis."""
 ELLIPSE_WORLD: dict[str, Any] = {**SWARM_WORLD, "ellipse_counts_learner": True, "learner_speed_limit_m_s": 1.5}
 """The world of the presets (see `learner.presets`)."""
+BEST_WORLD = {**ELLIPSE_WORLD, "ellipse_reward": "progress"}
 ELLIPSE_PRESETS = {
     "thesis": Preset({"n_step": 1, "samples_per_insert": 4.0}, ELLIPSE_WORLD),
-    "best": Preset({"n_step": 3, "samples_per_insert": 4.0}, {**ELLIPSE_WORLD, "ellipse_reward": "progress"}),
+    "best": Preset({"n_step": 3, "samples_per_insert": 4.0}, BEST_WORLD),
+    "generalist": Preset(
+        {"discount": 0.97, "network": "pooled"}, {**BEST_WORLD, "group_rows": 16, "decision_interval_steps": 4}
+    ),
 }
 
 

@@ -8,8 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_core.config import WorldConfig
-from sim_core.methods.base import Rule
-from sim_core.methods.group_ellipses import ELLIPSE_COLUMNS, FIELD_COLUMNS, EllipseMethod
+from sim_core.methods.base import Preset, Rule
+from sim_core.methods.group_ellipses import (
+    BEST_WORLD,
+    ELLIPSE_COLUMNS,
+    ELLIPSE_PRESETS,
+    FIELD_COLUMNS,
+    EllipseMethod,
+)
 from sim_core.methods.headings import heading_velocities
 
 
@@ -19,6 +25,25 @@ class InsideMethod(EllipseMethod):
     label = "M_IN"
     robot_module = "learner.export.ellipse_methods:InsideRobot"
     row_size = ELLIPSE_COLUMNS + FIELD_COLUMNS
+    presets = {
+        **ELLIPSE_PRESETS,
+        "generalist": Preset(
+            {
+                "discount": 0.98,
+                "network": "pooled",
+                "total_env_steps": 3_000_000,
+                "learning_rate_decay_env_steps": 3_000_000,
+            },
+            {
+                **BEST_WORLD,
+                "group_rows": 16,
+                "decision_interval_steps": 2,
+                "history": 2,
+                "sectors": 16,
+                "stop_action": True,
+            },
+        ),
+    }
 
     @classmethod
     def rules(cls, config: WorldConfig) -> dict[str, Rule]:

@@ -26,7 +26,6 @@ from actors.service.messages import EpisodeStats
 from deploy.cli import main as shoal
 from deploy.runs.policy_lookup import find_policy
 from learner.presets import preset_config
-from learner.ray_backend.cluster import evaluate_in_tasks
 from learner.run_folder import RunFolder
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig
@@ -80,6 +79,8 @@ def trained(method: str, seed: int, runs_dir: Path, settings: list[str]) -> RunF
 
 def results(method: str, options: argparse.Namespace) -> Iterator[list[Played]]:
     """What the players did, setup after setup; the rules first."""
+    from learner.ray_backend.cluster import evaluate_in_tasks  # imports Ray, which `shoal train` configures first
+
     folders = [trained(method, seed, options.runs_dir, options.train) for seed in options.seeds]
     base = folders[0].config()
     unseen = [dataclasses.replace(base.world, robots=robots, groups=groups) for robots, groups in UNSEEN]
