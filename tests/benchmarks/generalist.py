@@ -71,7 +71,7 @@ def trained(method: str, seed: int, runs_dir: Path, settings: list[str]) -> RunF
     """The run of a training, which is made unless it is there."""
     folder = RunFolder(runs_dir / f"{method}-{seed}")
     arguments = ["--preset", "generalist", "--method", method, "--seed", str(seed), *settings]
-    place = ["--runs-dir", str(runs_dir), "--name", folder.path.name, "--or-resume"]
+    place = ["--runs-dir", str(runs_dir), "--name", folder.path.name, "--or-resume", "True"]
     if shoal(["train", *arguments, *place]):
         raise SystemExit(f"the training {folder.path} has not come to its end")
     return folder
@@ -79,8 +79,6 @@ def trained(method: str, seed: int, runs_dir: Path, settings: list[str]) -> RunF
 
 def results(method: str, options: argparse.Namespace) -> Iterator[list[Played]]:
     """What the players did, setup after setup; the rules first."""
-    from learner.ray_backend.cluster import evaluate_in_tasks  # imports Ray, which `shoal train` configures first
-
     folders = [trained(method, seed, options.runs_dir, options.train) for seed in options.seeds]
     base = folders[0].config()
     unseen = [dataclasses.replace(base.world, robots=robots, groups=groups) for robots, groups in UNSEEN]
@@ -88,6 +86,8 @@ def results(method: str, options: argparse.Namespace) -> Iterator[list[Played]]:
     players: dict[str, Candidate] = {str(rule): rule for rule in RULES if exists(rule, base.world)}
     for seed, folder in zip(options.seeds, folders, strict=True):
         players[f"seed {seed}"] = find_policy(folder, folder.config())
+    from learner.ray_backend.cluster import evaluate_in_tasks  # imports Ray, which `shoal train` configures first
+
     specs = [EnvSpec(ENV_ID, world) for world in worlds]
     seeds = list(range(options.first_seed, options.first_seed + options.episodes))
     stats = {name: evaluate_in_tasks(specs, player, seeds, None) for name, player in players.items()}

@@ -161,13 +161,16 @@ def copy_of_the_code(folder: Path) -> Path:
     return folder
 
 
-def submit(head: Head, checkout: Path, config: RunConfig, runs: Path, log: Path, *options: str) -> subprocess.Popen:
-    """`shoal submit train` in the background."""
-    words = ["submit", "--address", head.address, *options, "train", "--runs-dir", str(runs), *flags(config)]
+def submit(
+    head: Head, checkout: Path, config: RunConfig, runs: Path, log: Path, *options: str, cwd: Path | None = None
+) -> subprocess.Popen:
+    """`shoal submit train` in the background, from the folder `cwd`, the checkout by default."""
+    place = ["--address", head.address, "--working-dir", str(checkout)]
+    words = ["submit", *place, *options, "train", "--runs-dir", str(runs), *flags(config)]
     with log.open("w") as file:
         return subprocess.Popen(
             [sys.executable, "-W", "error::DeprecationWarning:__main__", "-m", "deploy", *words],
-            cwd=checkout,
+            cwd=cwd or checkout,
             env={**clean_environment(), **NO_TOKEN, "PYTHONPATH": str(checkout)},
             stdout=file,
             stderr=subprocess.STDOUT,

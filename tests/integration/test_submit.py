@@ -1,7 +1,9 @@
 """`shoal submit` on a real Ray of one node: Ctrl-C saves a checkpoint, the same command goes on from it."""
 
 import dataclasses
+import functools
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,7 +13,10 @@ from pathlib import Path
 import mlflow
 import pytest
 
+import deploy
 from learner.checkpoints.checkpoint import newest_valid
+from sim_core import ENV_ID
+from sim_core.config import WorldConfig
 from tests.integration.conftest import SMALL, clean_environment
 from tests.integration.jobs import wait_for
 from tests.integration.ray_head import NO_TOKEN, Head, copy_of_the_code, finish, running_head, submit
@@ -43,14 +48,28 @@ def the_run(runs: Path):
     return run
 
 
-def test_stop_saves_a_checkpoint_and_the_same_command_goes_on(head, checkout, tmp_path):
+@pytest.fixture
+def own_method(tmp_path, monkeypatch):
+    """(run with a user's own method, the folder of its file): no job runs in that folder, and the name is relative."""
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    shutil.copy(Path(deploy.__file__).parent / "examples" / "compass.py", folder / "mine.py")
+    monkeypatch.chdir(folder)
+    world = WorldConfig(method="mine.py:Compass", robots=3, groups=2, horizon_steps=60)
+    return dataclasses.replace(LONG, env_id=ENV_ID, world=world), folder
+
+
+def test_stop_saves_a_checkpoint_and_the_same_command_goes_on(head, checkout, tmp_path, own_method):
+    """The run's method lies in a user's file outside the checkout, which travels with the job."""
+    long, elsewhere = own_method
     runs, log = tmp_path / "runs", tmp_path / "log"
-    first = submit(head, checkout, LONG, runs, log)
+    submitted = functools.partial(submit, head, checkout, long, runs, cwd=elsewhere)
+    first = submitted(log)
     wait_for(lambda: len(list(runs.glob("*/checkpoints/step-*[0-9]"))) >= 2, log.read_text, first)
 
-    watching = submit(head, checkout, LONG, runs, tmp_path / "other", "--follow", "False")
+    watching = submitted(tmp_path / "other", "--follow", "False")
     code, text = finish(watching, tmp_path / "other")
-    assert code == 0 and re.search(r"following job shoal-train-CartPole-v1-s0-\w+-1, which is under way", text), text
+    assert code == 0 and re.search(r"following job shoal-train-Compass-3r2g-s0-\w+-1, which is under way", text), text
 
     first.send_signal(signal.SIGINT)
     code, text = finish(first, log)
@@ -61,17 +80,18 @@ def test_stop_saves_a_checkpoint_and_the_same_command_goes_on(head, checkout, tm
     (run,) = (path.parent for path in runs.glob("*/config.json"))
     checkpoint, _ = newest_valid(run / "checkpoints")
     stopped_at = checkpoint.state["env_steps"]
-    assert stopped_at == int(found[1].replace(",", "")) < LONG.total_env_steps
+    assert stopped_at == int(found[1].replace(",", "")) < long.total_env_steps
     assert the_run(runs).info.status == "KILLED"
 
-    code, text = finish(submit(head, checkout, LONG, runs, log), log)
+    code, text = finish(submitted(log), log)
     assert code == 0, text
     assert f"going on from {checkpoint.folder}" in text
-    assert re.search(r"job shoal-train-CartPole-v1-s0-\w+-2 on", text)
-    assert newest_valid(run / "checkpoints")[0].state["env_steps"] >= LONG.total_env_steps
+    assert re.search(r"job shoal-train-Compass-3r2g-s0-\w+-2 on", text)
+    assert newest_valid(run / "checkpoints")[0].state["env_steps"] >= long.total_env_steps
+    assert (run / "user_files" / "method" / "mine.py").read_text() == (elsewhere / "mine.py").read_text()
     assert (the_run(runs).info.status, the_run(runs).data.tags["attempts"]) == ("FINISHED", "2")
 
-    code, text = finish(submit(head, checkout, LONG, runs, log), log)
+    code, text = finish(submitted(log), log)
     assert code == 0 and "has finished before" in text, text
     assert the_run(runs).data.tags["attempts"] == "2"
 

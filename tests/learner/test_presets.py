@@ -28,9 +28,25 @@ def test_thesis_has_the_numbers_of_tables_3_2_and_4_2(method):
     assert world.swarm_knows_learner == "method" and config.algorithm == "double_dqn"
 
 
-@pytest.mark.parametrize(
-    ("method", "ours"), [("sensor", "sensor_counts"), ("in", "ellipse_reward"), ("out", "ellipse_reward")]
-)
-def test_best_changes_state_or_reward_of_a_world_and_nothing_else(method, ours):
+OURS = {
+    "sensor": {"sensor_counts", "decision_interval_steps", "horizon_is"},
+    "in": {"ellipse_reward"},
+    "out": {"ellipse_reward"},
+}
+"""World settings in which `best` differs from `thesis`."""
+
+
+@pytest.mark.parametrize("method", OURS)
+def test_best_plays_in_the_world_of_thesis(method):
     thesis, best = (dataclasses.asdict(preset_config(name, method, 10, 2).world) for name in ("thesis", "best"))
-    assert [name for name in thesis if thesis[name] != best[name]] == [ours]
+    assert {name for name in thesis if thesis[name] != best[name]} == OURS[method]
+
+
+@pytest.mark.parametrize("method", OURS)
+def test_a_generalist_learns_all_setups_in_the_world_of_best(method):
+    best, general = (preset_config(name, method, 10, 2) for name in ("best", "generalist"))
+    assert [(world.robots, world.groups) for world in general.env.worlds] == [(r, g) for r in ROBOTS for g in GROUPS]
+    acts = {"decision_interval_steps", "group_rows", "history", "sectors", "stop_action"}
+    one, other = (dataclasses.asdict(config.world) for config in (best, general))
+    assert {name for name in one if one[name] != other[name]} <= acts
+    assert (general.network == "pooled") == (method != "sensor")
