@@ -28,6 +28,7 @@ class RunEpisodes:
 
     def __init__(self, folder: RunFolder) -> None:
         self._config = folder.config()
+        self._spec = self._config.env.of_setup(self._config.world)  # of several setups, the run's own
         self._policy = NewestPolicy(folder, self._config)
         self._weights: WeightsSnapshot | None = None
         self._seeds: dict[str, list[int]] = {}
@@ -48,7 +49,7 @@ class RunEpisodes:
         """Plays the episodes; their seeds by outcome."""
         first = self._config.final_eval_first_seed
         seeds = list(range(first, first + EPISODES))
-        outcomes = evaluate(self._config.env, weights, seeds).outcome
+        outcomes = evaluate(self._spec, weights, seeds).outcome
         return {
             outcome.name.lower(): [seed for seed, end in zip(seeds, outcomes, strict=True) if end == outcome]
             for outcome in ENDED
@@ -59,4 +60,4 @@ class RunEpisodes:
         if key != KEY or self._weights is None:
             raise LookupError(f"group {key!r}")
         seed = nth(self._seeds.get(outcome, []), number)
-        return player_data(record_episode(self._config.env, self._weights, seed), self._config.world)
+        return player_data(record_episode(self._spec, self._weights, seed), self._config.world)

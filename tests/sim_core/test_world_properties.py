@@ -29,11 +29,11 @@ def batch(name, seeds):
 
 
 def plan(seeds):
-    """Yields per step (actions or None, worlds to restart before it); a world's entries depend on its seed alone."""
+    """Yields per step (actions or a pilot, worlds to restart before it); a world's entries depend on its seed alone."""
     actions = np.stack([np.random.default_rng(seed).integers(0, 8, STEPS) for seed in seeds], axis=1)
     for step in range(STEPS):
         restarts = np.array([(3 * step + 5 * seed) % 23 == 0 for seed in seeds])
-        yield (actions[step] if step % 3 else None), restarts
+        yield (actions[step] if step % 3 else Pilot.FREE), restarts
 
 
 def records(worlds, seeds):

@@ -202,7 +202,7 @@ def test_results_of_more_episodes_are_accepted():
         ({"episodes": 0}, "episodes must be at least 1"),
         ({"extrapolation_episodes": 0}, "extrapolation_episodes must be at least 1"),
         ({"env_steps": 0}, "env_steps must be at least 1"),
-        ({"baselines": ("swarm",)}, "baselines must be among fl-orca, greedy, random"),
+        ({"baselines": ("swarm",)}, "baselines must be among fl-orca, fl-orca-snapped, greedy, field, random"),
         ({"baseline_episodes": 0}, "baseline_episodes must be at least 1"),
         ({"first_seed": -1}, "first_seed must be in"),
         ({"first_seed": 2**32 - 5}, "first_seed must be in"),

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from actors.policy.network import NETWORKS
+from actors.policy.network import make_network
 from learner.update.double_dqn import Batch
 from learner.update.gradients import AutogradGradients, FlatNetwork, HandWrittenGradients
 
 
 def networks(observation_size, hidden_sizes, num_actions, seed=0, kind="plain"):
     torch.manual_seed(seed)
-    return [FlatNetwork(NETWORKS[kind](observation_size, hidden_sizes, num_actions)) for _ in range(2)]
+    return [FlatNetwork(make_network(kind, observation_size, hidden_sizes, num_actions)) for _ in range(2)]
 
 
 def random_batch(size, shape, num_actions, seed=0, weighted=False):
