@@ -12,6 +12,7 @@ class Compass(Method):
     """Two offsets in metres, cut at R2; headings, reward and outcome are M_sensor's."""
 
     swarm_knows_learner = True
+    fits_any_groups = True
 
     @classmethod
     def observation_names(cls, config):

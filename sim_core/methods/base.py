@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_core.checks import require
-from sim_core.config import WorldConfig
+from sim_core.config import MAX_ROBOTS, WorldConfig
 from sim_core.jit import kernel
 from sim_core.methods.headings import heading_velocities, write_headings
 from sim_core.methods.progress import came_closer
@@ -124,6 +124,8 @@ class Method:
     """Whether the swarm avoids the learning robot and counts it in its flock, unless the world says otherwise."""
     timeout_fails: ClassVar[bool] = False
     """Whether a timeout is a terminal failure, unless the world says otherwise; else it cuts the episode."""
+    fits_any_groups: ClassVar[bool] = False
+    """Whether an observation has the same size for every number of groups, so that a policy can be tested there."""
     row_size: ClassVar[int] = 0
     """Elements of a row, where an observation is rows of groups, the own one first and absent ones zero; else 0."""
     draws: ClassVar[frozenset[str]] = frozenset()
@@ -151,7 +153,7 @@ class Method:
     @classmethod
     def max_groups(cls, config: WorldConfig) -> int:
         """Most groups for which an observation has the size that it has in `config`, so that a policy fits there."""
-        return config.groups
+        return MAX_ROBOTS if cls.fits_any_groups else config.groups
 
     @classmethod
     def check(cls, config: WorldConfig) -> None:

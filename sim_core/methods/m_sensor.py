@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_core.config import MAX_ROBOTS, WorldConfig
+from sim_core.config import WorldConfig
 from sim_core.jit import kernel
 from sim_core.methods.base import Method, Preset, Rule
 from sim_core.methods.progress import goal_offset
@@ -121,6 +121,7 @@ class SensorMethod(Method):
 
     label = "M_sensor"
     swarm_knows_learner = True
+    fits_any_groups = True
     draws = frozenset({"sectors"})
     presets = {
         "thesis": Preset({"n_step": 1, "samples_per_insert": 1.5}, WORLD),
@@ -158,11 +159,6 @@ class SensorMethod(Method):
             for region in regions
             for sector in range(config.sectors)
         )
-
-    @classmethod
-    def max_groups(cls, config: WorldConfig) -> int:
-        """Counts have one size, whatever the number of groups."""
-        return MAX_ROBOTS
 
     @classmethod
     def check(cls, config: WorldConfig) -> None:
