@@ -94,15 +94,6 @@ def start_head(folder: Path, log: Path, *words: str) -> tuple[subprocess.Popen, 
     return ray_start(log, *words, *as_flags(ports), auth=NO_TOKEN), ports
 
 
-def end(process: subprocess.Popen) -> None:
-    """Ends a node and what it started."""
-    family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
-    process.terminate()
-    process.wait(PATIENCE_S)
-    for left in psutil.wait_procs(family, timeout=20)[1]:
-        left.kill()
-
-
 @contextmanager
 def running_head(log: Path, *words: str) -> Iterator[Head]:
     """A head node; it is started again where Ray's own 30 s for it were too short on a busy machine."""
@@ -117,7 +108,7 @@ def running_head(log: Path, *words: str) -> Iterator[Head]:
             wait_for(lambda: answers(f"{address}/api/jobs/"), log.read_text, process)
             yield Head(address, f"127.0.0.1:{ports['port']}", folder / "session_latest")
         finally:
-            end(process)
+            kill(process)  # Ray's own end takes 20 s and more, and no test asks how it goes
 
 
 @contextmanager
@@ -132,7 +123,7 @@ def joined_node(head: Head, log: Path, *words: str) -> Iterator[subprocess.Popen
             yield node
         finally:
             if node.poll() is None:
-                end(node)
+                kill(node)
 
 
 def kill(node: subprocess.Popen) -> None:

@@ -17,7 +17,7 @@ from learner.tracking.fault_log import read_faults
 from tests.integration.conftest import PATIENCE_S, SMALL, clean_environment, flags
 from tests.integration.jobs import wait_for
 from tests.integration.machines import SlowCable, at, machines
-from tests.integration.ray_head import ROOT, end, kill, ray_start, short_folder, with_token
+from tests.integration.ray_head import ROOT, kill, ray_start, short_folder, with_token
 
 pytestmark = [
     pytest.mark.ray,
@@ -77,7 +77,7 @@ class Cluster:
     def close(self) -> None:
         for node in self.nodes:
             if node.poll() is None:
-                end(node)
+                kill(node)
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import pytest
 
 from tests.integration.machines import at, connect, machines, on, root
-from tests.integration.ray_head import ROOT, copy_of_the_code, end, ray_start, short_folder, with_token
+from tests.integration.ray_head import ROOT, copy_of_the_code, kill, ray_start, short_folder, with_token
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 
@@ -78,7 +78,7 @@ def token(trio) -> Iterator[str]:
         process = ray_start(log, *words, f"--temp-dir={folder}", auth=with_token(secret), before=at(trio.head))
         assert process.poll() is None, log.read_text()
         yield secret
-        end(process)
+        kill(process)
 
 
 @pytest.fixture
