@@ -17,6 +17,7 @@ from actors.evaluation.trajectory import save_episodes
 from actors.policy.baselines import Baseline, check_exists
 from actors.rollout.vector_env import EnvSpec
 from actors.rollout.worker import join_stats
+from actors.service.messages import EpisodeStats
 from deploy.console.summary_tables import compared, evaluation_table, setups_table
 from deploy.options.results import Evaluate
 from deploy.options.training import ray_address
@@ -59,11 +60,10 @@ def run(command: Evaluate) -> int:
     if command.out is not None:
         _check_outputs(command.out, command.record, target.spec)
     seeds = list(range(command.first_seed, command.first_seed + command.episodes))
-    specs = [target.spec.of_setup(world) for world in target.spec.worlds]
-    played = evaluate_in_tasks(specs, target.candidate, seeds, ray_address(command.address))
+    played = _play(command, target, seeds)
     stats = join_stats(played)
-    if len(specs) > 1:
-        setups = (spec.world.setup for spec in specs)
+    if len(played) > 1:
+        setups = (world.setup for world in target.spec.worlds)
         Console().print(setups_table(dict(zip(setups, map(summarise, played), strict=True))))
     kind = "episodes" if isinstance(target.candidate, Baseline) else "greedy episodes"
     Console().print(evaluation_table(summarise(stats), target.title, kind))
@@ -73,6 +73,12 @@ def run(command: Evaluate) -> int:
         save_evaluation(command.out, StoredEvaluation(target.spec, target.name, target.updates, seed, stats))
         Console().print(str(command.out), highlight=False, soft_wrap=True)
     return 0
+
+
+def _play(command: Evaluate, target: Target, seeds: list[int]) -> list[EpisodeStats]:
+    """The player's episodes in each of its setups, from one start of Ray."""
+    specs = [target.spec.of_setup(world) for world in target.spec.worlds]
+    return evaluate_in_tasks(specs, target.candidate, seeds, ray_address(command.address))
 
 
 def _targets(command: Evaluate) -> list[Target]:
@@ -113,12 +119,11 @@ def _compare(command: Evaluate, targets: list[Target]) -> int:
     table = Table(title=f"{command.episodes} episodes a setup; differences to {first.name} are paired")
     for name in ("setup", "player", "success rate", "95 % interval", "difference", "95 % interval", "sign test"):
         table.add_column(name, justify="left" if name in ("setup", "player") else "right")
+    played = [_play(command, target, seeds) for target in targets]
     for i, world in enumerate(first.spec.worlds):
         goals = list[NDArray[np.bool_]]()
-        for target in targets:
-            specs = [target.spec.of_setup(target.spec.worlds[i])]
-            (stats,) = evaluate_in_tasks(specs, target.candidate, seeds, ray_address(command.address))
-            goals.append(stats.outcome == int(Outcome.GOAL))
+        for target, stats in zip(targets, played, strict=True):
+            goals.append(stats[i].outcome == int(Outcome.GOAL))
             table.add_row(*compared(world.setup if target is first else "", target.name, goals))
         table.add_section()
     Console().print(table)
