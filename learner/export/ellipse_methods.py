@@ -184,6 +184,10 @@ class EllipseRobot(RobotModule):
           mask: `[batch, groups, robots]` bool, False where there is no robot.
           goals: relative positions `[batch, groups, 2]` float32 of every group's goal.
         """
+        return self._decide(positions, mask, goals, None)
+
+    def _decide(self, positions: Tensor, mask: Tensor, goals: Tensor, held: Tensor | None) -> Decision:
+        """As `forward`; goes on with the actions `held` `[batch]` int64 where they are not DECIDE."""
         positions = torch.where(mask.unsqueeze(-1), positions, 0.0)
         matrix = self._matrix(positions, mask, goals)
         if self.config.group_order == "nearest":
@@ -192,6 +196,8 @@ class EllipseRobot(RobotModule):
         values = self.network(observation)
         known = mask.any(2).all(1)
         action = values.argmax(1)
+        if held is not None:
+            action = torch.where(held >= 0, held, action)
         velocity = torch.where(known.unsqueeze(1), self._velocity(action, positions, mask), 0.0)
         return velocity, torch.where(known, action, NO_DECISION), values, observation
 
@@ -238,12 +244,7 @@ class OutsideRobot(EllipseRobot):
           positions, mask, goals: as the others'.
           held: `[batch]` int64, the action of the last decision, or DECIDE.
         """
-        velocity, action, values, observation = super().forward(positions, mask, goals)
-        positions = torch.where(mask.unsqueeze(-1), positions, 0.0)
-        held_velocity = self._velocity(held.clamp(min=0), positions, mask)
-        holds = (held >= 0) & (action != NO_DECISION)
-        velocity = torch.where(holds.unsqueeze(1), held_velocity, velocity)
-        return velocity, torch.where(holds, held, action), values, observation
+        return self._decide(positions, mask, goals, held)
 
     def _velocity(self, action: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
         """The velocity `[batch, 2]` float32 of an action: u_nn + u_apf, no faster than the limit."""
