@@ -60,13 +60,11 @@ class JoinedVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDAr
         """What the parts tell of ended episodes; a part without any adds rows that its masks leave out."""
         if not any(infos):
             return {}
-        names = next(info for info in infos if info)["final_info"]
         final: Arrays = {}
-        for name in names:
-            dtype = next(info for info in infos if info)["final_info"][name].dtype
+        for name, column in next(info for info in infos if info)["final_info"].items():
             final[name] = np.concatenate(
                 [
-                    info["final_info"][name] if info else np.zeros(part.num_envs, dtype)
+                    info["final_info"][name] if info else np.zeros(part.num_envs, column.dtype)
                     for part, info in zip(self._parts, infos, strict=True)
                 ]
             )

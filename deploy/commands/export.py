@@ -92,15 +92,17 @@ def _exportable(command: Export, config: RunConfig, weights: WeightsSnapshot) ->
 def metadata(config: RunConfig, weights: WeightsSnapshot, bare: bool) -> dict[str, Any]:
     """The metadata of an exported file, in addition to its inputs and outputs."""
     world = config.world
-    robot = {} if bare else {"method": world.method_name, "setup": world.setup, "frame": FRAME}
-    timing = {
+    robot = {
+        "method": world.method_name,
+        "setup": world.setup,
+        "frame": FRAME,
         "time_step_s": world.time_step_s,
         "decision_interval_steps": world.decision_interval_steps,
         "outer_radius_m": world.outer_radius_m,
     }
     origin = {"run": config.name, "config_hash": config_hash(config), "updates": weights.version}
     settings = {"commit": git_commit(), "settings": to_dict(config)}
-    return {"format": FORMAT, "env_id": config.env_id, **robot, **({} if bare else timing), **origin, **settings}
+    return {"format": FORMAT, "env_id": config.env_id, **({} if bare else robot), **origin, **settings}
 
 
 def run(command: Export) -> int:

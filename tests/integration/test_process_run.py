@@ -129,40 +129,37 @@ def test_another_seed_is_another_run(small, tmp_path):
     assert not np.array_equal(one["learner/online.layers.0.weight"], two["learner/online.layers.0.weight"])
 
 
+def resumed_arrays(whole, tmp_path):
+    """Trains a run at once and in two halves, which must be the same; names of the arrays of its last checkpoint."""
+    train(whole, tmp_path / "whole")
+    train(dataclasses.replace(whole, total_env_steps=3_072), tmp_path / "halves")
+    train(whole, tmp_path / "halves")
+    halves = final_state(tmp_path / "halves")
+    assert_same(final_state(tmp_path / "whole"), halves)
+    return set(halves[0])
+
+
 def test_a_resumed_run_of_several_setups_is_the_uninterrupted_one(small, tmp_path):
     world = dataclasses.replace(small.world, decision_interval_steps=4)
     whole = dataclasses.replace(
         small, world=world, setups=("3x2", "4x1:2", "2x3"), policy_average_updates=20, workers=2
     )
-    train(whole, tmp_path / "whole")
-    train(dataclasses.replace(whole, total_env_steps=3_072), tmp_path / "halves")
-    train(whole, tmp_path / "halves")
-    halves = final_state(tmp_path / "halves")
-    names = set(halves[0])
+    names = resumed_arrays(whole, tmp_path)
     assert {"worker-0/world_0.pos_x", "worker-1/world_2.pos_x", "learner/average.layers.0.weight"} <= names
-    assert_same(final_state(tmp_path / "whole"), halves)
 
 
 def test_a_resumed_run_of_a_pooled_network_is_the_uninterrupted_one(small, tmp_path):
     world = dataclasses.replace(small.world, method="out", robots=3, groups=2, group_rows=5)
     whole = dataclasses.replace(small, world=world, setups=("3x2", "4x5"), network="pooled", hidden_sizes=(16, 16))
-    train(whole, tmp_path / "whole")
-    train(dataclasses.replace(whole, total_env_steps=3_072), tmp_path / "halves")
-    train(whole, tmp_path / "halves")
-    halves = final_state(tmp_path / "halves")
-    assert "learner/online.rows.0.weight" in halves[0]
-    assert_same(final_state(tmp_path / "whole"), halves)
+    names = resumed_arrays(whole, tmp_path)
+    assert "learner/online.rows.0.weight" in names
 
 
 @pytest.mark.parametrize("shards", [1, 3])
 def test_a_resumed_run_with_every_option_is_the_uninterrupted_one(small, tmp_path, shards):
     whole = dataclasses.replace(small, replay_shards=shards, workers=2, replay_capacity=4_200, **OPTIONS)
-    train(whole, tmp_path / "whole")
-    train(dataclasses.replace(whole, total_env_steps=3_072), tmp_path / "halves")
-    train(whole, tmp_path / "halves")
-    halves = final_state(tmp_path / "halves")
-    assert "shard-0.zarr/priorities/priority" in halves[0]
-    assert_same(final_state(tmp_path / "whole"), halves)
+    names = resumed_arrays(whole, tmp_path)
+    assert "shard-0.zarr/priorities/priority" in names
 
 
 @pytest.mark.parametrize("shards", [1, 3])

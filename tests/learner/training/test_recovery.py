@@ -331,7 +331,10 @@ def test_components_fail_while_training_goes_on_and_checkpoints_are_written(run,
     def fault(node, method):
         if method == "saved" and id(node) in asked:
             return None  # how often a node is asked depends on the speed of the disk
-        asked.discard(id(node)) if method == "save" else asked.add(id(node)) if method == "saved" else None
+        if method == "saved":
+            asked.add(id(node))
+        elif method == "save":
+            asked.discard(id(node))
         rate = 0.08 if method in ("save", "saved") else 0.01
         if not isinstance(node, RolloutNode | ShardNode) or rng.random() >= rate:
             return None
