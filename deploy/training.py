@@ -5,9 +5,8 @@ from __future__ import annotations
 import shlex
 import signal
 
-from rich.console import Console
-
 from deploy.console.summary_tables import evaluation_table, setups_table, summary_lines
+from deploy.console.terminal import plain_console
 from deploy.console.training_display import make_display
 from deploy.runs.artifacts import log_artifacts
 from learner.checkpoints.checkpoint import Checkpoint
@@ -35,8 +34,8 @@ def open_tracker(identity: RunIdentity) -> Tracker:
 def print_resume_point(checkpoint: Checkpoint, skipped: list[str]) -> None:
     """Prints the checkpoint from which a run resumes, and why newer ones were skipped."""
     for reason in skipped:
-        Console().print(f"skipped: {reason}", markup=False, highlight=False, soft_wrap=True)
-    Console().print(f"going on from {checkpoint.folder}", markup=False, highlight=False, soft_wrap=True)
+        plain_console().print(f"skipped: {reason}", soft_wrap=True)
+    plain_console().print(f"going on from {checkpoint.folder}", soft_wrap=True)
 
 
 def resume_training(
@@ -58,8 +57,8 @@ def run_training(
     folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, options: ClusterOptions
 ) -> int:
     """Trains to the end or to a signal; returns the exit code, 128 + the signal's number after one."""
-    console = Console()
-    console.print(f"run {folder.path}", highlight=False, soft_wrap=True)
+    console = plain_console()
+    console.print(f"run {folder.path}", soft_wrap=True)
     with make_display(console, config.total_env_steps) as display:
 
         def finish(result: RunResult, rows: list[Row]) -> None:
@@ -70,14 +69,14 @@ def run_training(
     if result.evaluation is None:
         name = signal.Signals(result.stopped_by).name if result.stopped_by else "a signal"
         saved = "checkpoint saved" if result.checkpoint else "its checkpoint could not be written"
-        console.print(f"stopped by {name} at {result.env_steps:,} env steps; {saved}", highlight=False)
-        console.print(f"resume with: {resume_command(folder)}", highlight=False, soft_wrap=True)
+        console.print(f"stopped by {name} at {result.env_steps:,} env steps; {saved}")
+        console.print(f"resume with: {resume_command(folder)}", soft_wrap=True)
         return 128 + (result.stopped_by or 0)
     console.print(evaluation_table(result.evaluation, config.name))
     if result.by_setup:
         console.print(setups_table(result.by_setup))
     for line in summary_lines(folder, result, public_uri(tracker.uri), config.env.is_swarm):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
     return 0
 
 

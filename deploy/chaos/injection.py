@@ -161,7 +161,7 @@ class ChaosRun:
         self._print(kind)
 
     def _print(self, kind: FaultKind) -> None:
-        self._console.print(f"{kind.victim} {kind.action}", highlight=False)
+        self._console.print(f"{kind.victim} {kind.action}")
 
     def _end_transient_faults(self) -> None:
         due = [item for item in self._pending_ends if item[0] <= time.monotonic()]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from rich.console import Console
-
 from deploy.chaos.config import CONFIG, NAME, write_config
 from deploy.chaos.faults import fault_table, with_recovery
 from deploy.chaos.injection import ChaosRun
 from deploy.chaos.invariants import broken_invariants, final_success
+from deploy.console.terminal import plain_console
 from deploy.options.training import Chaos
 from deploy.runs.folders import make_folder
 from learner.tracking.fault_log import read_faults
@@ -23,7 +22,7 @@ def run(command: Chaos) -> int:
     require(not (command.out / NAME).exists(), f"{command.out / NAME} exists already; name another --out")
     make_folder(command.out, "--out")
     write_config(command.out / CONFIG, command.env_steps)
-    console = Console()
+    console = plain_console()
     chaos = ChaosRun(command, console)
     try:
         chaos.start()
@@ -37,8 +36,8 @@ def run(command: Chaos) -> int:
         chaos.end()
     console.print(fault_table(faults))
     for sentence in wrong:
-        console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+        console.print(sentence, soft_wrap=True)
     if not wrong:
         console.print(f"{len(faults)} faults; target reached, accounts balance, MLflow has every row once")
-        console.print(f"success rate {success}", highlight=False)
+        console.print(f"success rate {success}")
     return 1 if wrong else 0

@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from dashboards.pages.report_page import report_data, report_page
 from dashboards.pages.server import PageServer, episode_number
 from deploy.console.serving import serve_until_interrupted
+from deploy.console.terminal import plain_console
 from deploy.options.results import Dashboard
 from deploy.report_data.episode_sources import embedded_episodes
 from deploy.report_data.sources import ReportSource, find_report_source
@@ -32,7 +31,7 @@ def run(command: Dashboard) -> int:
     path = command.out or source.folder / FILE_NAME
     make_folder(path.parent, "--out")
     write_report(source, path, command.episodes, command.episodes_mb)
-    Console().print(str(path), highlight=False, soft_wrap=True)
+    plain_console().print(str(path), soft_wrap=True)
     return 0
 
 
@@ -46,7 +45,7 @@ def write_report(source: ReportSource, path: Path, episodes: int, episodes_mb: f
       episodes_mb: largest size of all embedded episodes, in megabytes.
     """
     contents = source.contents()
-    with Console(stderr=True).status("playing the episodes that the file embeds"):
+    with plain_console(stderr=True).status("playing the episodes that the file embeds"):
         chosen = embedded_episodes(source.episodes, contents.groups, episodes, episodes_mb * MEGABYTE)
     embedded = {key.split("|")[0] for key in chosen}
     note = f"{contents.episodes_note} This file holds {len(chosen)}; `shoal dashboard --serve` plays all."

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.table import Table
 
 from actors.evaluation.evaluation_store import StoredEvaluation, refuse_existing, save_evaluation
@@ -19,6 +18,7 @@ from actors.rollout.vector_env import EnvSpec
 from actors.rollout.worker import join_stats
 from actors.service.messages import EpisodeStats
 from deploy.console.summary_tables import compared, evaluation_table, setups_table
+from deploy.console.terminal import plain_console
 from deploy.options.results import Evaluate
 from deploy.options.training import ray_address
 from deploy.runs.folders import make_folder
@@ -64,14 +64,14 @@ def run(command: Evaluate) -> int:
     stats = join_stats(played)
     if len(played) > 1:
         setups = (world.setup for world in target.spec.worlds)
-        Console().print(setups_table(dict(zip(setups, map(summarise, played), strict=True))))
+        plain_console().print(setups_table(dict(zip(setups, map(summarise, played), strict=True))))
     kind = "episodes" if isinstance(target.candidate, Baseline) else "greedy episodes"
-    Console().print(evaluation_table(summarise(stats), target.title, kind))
+    plain_console().print(evaluation_table(summarise(stats), target.title, kind))
     if command.out is not None:
         _record(command.out, target, seeds[: command.record])
         seed = np.array(seeds, np.int64)
         save_evaluation(command.out, StoredEvaluation(target.spec, target.name, target.updates, seed, stats))
-        Console().print(str(command.out), highlight=False, soft_wrap=True)
+        plain_console().print(str(command.out), soft_wrap=True)
     return 0
 
 
@@ -126,7 +126,7 @@ def _compare(command: Evaluate, targets: list[Target]) -> int:
             goals.append(stats[i].outcome == int(Outcome.GOAL))
             table.add_row(*compared(world.setup if target is first else "", target.name, goals))
         table.add_section()
-    Console().print(table)
+    plain_console().print(table)
     return 0
 
 
@@ -187,4 +187,4 @@ def _record(out: Path, target: Target, seeds: list[int]) -> None:
     if seeds:
         episodes = [record_episode(target.spec, target.candidate, seed) for seed in seeds]
         save_episodes(episodes_path(out), episodes, target.spec.world)
-        Console().print(str(episodes_path(out)), highlight=False, soft_wrap=True)
+        plain_console().print(str(episodes_path(out)), soft_wrap=True)

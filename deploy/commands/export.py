@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rich.console import Console
 from rich.table import Table
 from torch import nn
 
 from actors.policy.network import load_snapshot
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import env_shape
+from deploy.console.terminal import plain_console
 from deploy.options.results import Export
 from deploy.runs.folders import make_folder
 from deploy.runs.policy_lookup import find_policy
@@ -134,9 +134,9 @@ def run(command: Export) -> int:
     make_folder(out.absolute().parent, "--out")
     module, inputs, outputs, states = _exportable(command, config, weights)
     found = write_export(out, module, inputs, outputs, metadata(config, weights, command.bare), states)
-    console = Console()
+    console = plain_console()
     console.print(agreement_table(found))
-    console.print(str(out), highlight=False, soft_wrap=True)
+    console.print(str(out), soft_wrap=True)
     return 0
 
 

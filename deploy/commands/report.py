@@ -7,8 +7,6 @@ import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from actors.evaluation.result_table import read_table
 from dashboards.analysis.aggregate import Results
 from dashboards.analysis.claim_text import claims_markdown, tally
@@ -17,6 +15,7 @@ from dashboards.analysis.comparison import baselines_of, presets_of
 from dashboards.figures.result_figures import PICTURES
 from dashboards.figures.style import save_png
 from dashboards.report import DRAWINGS, PresetSection, report_markdown
+from deploy.console.terminal import plain_console
 from deploy.options.results import Report
 from deploy.runs.folders import make_folder, write_text
 from deploy.runs.sweep_provenance import read_provenance
@@ -44,8 +43,8 @@ def run(command: Report) -> int:
     make_folder(command.out, "--out")
     _write(command.out, tables, sections)
     for section in sections:
-        Console().print(f"{section.name}: {tally(section.claims)}", highlight=False)
-    Console().print(str(command.out / "report.md"), highlight=False, soft_wrap=True)
+        plain_console().print(f"{section.name}: {tally(section.claims)}")
+    plain_console().print(str(command.out / "report.md"), soft_wrap=True)
     return 0
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from deploy.console.sweep_display import SweepDisplay, make_sweep_display
+from deploy.console.terminal import plain_console
 from deploy.options.training import Sweep
 from deploy.runs.folders import check_outlasts_job, check_plain_name, default_sweep_name
 from deploy.runs.sweep_results import SweepResults
@@ -73,10 +74,10 @@ def run(command: Sweep) -> int:
     check_plain_name(name)
     folder = (launch.runs_dir / SWEEPS / name).absolute()
     results = SweepResults(command.grid, folder, command.known)
-    console = Console(file=sys.stdout)  # explicitly: sys.stdout is replaced while Tune runs, to drop its output
-    console.print(f"sweep {folder}", highlight=False, soft_wrap=True)
+    console = plain_console(file=sys.stdout)  # explicitly: sys.stdout is replaced while Tune runs, to drop its output
+    console.print(f"sweep {folder}", soft_wrap=True)
     if results.left_out:
-        console.print(f"{results.left_out} rows of {command.known} are of other settings and left out", highlight=False)
+        console.print(f"{results.left_out} rows of {command.known} are of other settings and left out", soft_wrap=True)
     with _locked(folder):
         done = results.write()
         display = make_sweep_display(console, results.cells, done)
@@ -101,10 +102,10 @@ def _finish(console: Console, results: SweepResults, display: SweepDisplay) -> i
     done = results.write()
     console.print(display.table())
     for reason in display.failures():
-        console.print(f"failed: {reason}", markup=False, highlight=False, soft_wrap=True)
-    console.print(f"{len(done)} of {len(results.cells)} cells: {results.table}", highlight=False, soft_wrap=True)
+        console.print(f"failed: {reason}", soft_wrap=True)
+    console.print(f"{len(done)} of {len(results.cells)} cells: {results.table}", soft_wrap=True)
     if len(done) < len(results.cells):
-        console.print("the same command runs what is missing", highlight=False)
+        console.print("the same command runs what is missing")
         return 1
-    console.print(f"report: shoal report {results.table}", highlight=False, soft_wrap=True)
+    console.print(f"report: shoal report {results.table}", soft_wrap=True)
     return 0

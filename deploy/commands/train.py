@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import datetime
 
-from rich.console import Console
-
 from actors.policy.baselines import Baseline
 from actors.rollout.vector_env import env_shape
+from deploy.console.terminal import plain_console
 from deploy.options.training import Launch, Train
 from deploy.runs.folders import (
     check_outlasts_job,
@@ -95,7 +94,7 @@ def _resume(folder: RunFolder, config: RunConfig, options: ClusterOptions) -> in
     identity = folder.identity()
     tracker = open_tracker(identity)
     if config.total_env_steps <= known.total_env_steps and tracker.is_finished(identity.mlflow_run_id):
-        Console().print(f"run {folder.path} has finished before", highlight=False, soft_wrap=True)
+        plain_console().print(f"run {folder.path} has finished before", soft_wrap=True)
         return 0
     checkpoint = None
     if finished_names(folder.checkpoint_location()):

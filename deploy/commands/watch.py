@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.console import Console
-
 from actors.evaluation.evaluator import record_episode
 from actors.evaluation.trajectory import save_episodes
 from actors.policy.policy import WeightsSnapshot
 from dashboards.figures.film_strip import episode_strip_png
 from dashboards.figures.video import check_video_packages
 from deploy.console.serving import serve_until_interrupted
+from deploy.console.terminal import plain_console
 from deploy.live import live_server
 from deploy.options.results import Watch
 from deploy.runs.artifacts import foreign_animation, write_player, write_video
@@ -43,7 +42,7 @@ def run(command: Watch) -> int:
         require(command.format == "mp4", f"{config.env_id} can only be watched as a video; use --format mp4")
         made = foreign_animation(config, weights, command.seed, path)
         require(bool(made), f"{config.env_id} cannot be rendered to images (no rgb_array mode)")
-    Console().print(str(path), highlight=False, soft_wrap=True)
+    plain_console().print(str(path), soft_wrap=True)
     return 0
 
 
@@ -58,4 +57,4 @@ def _render_swarm(config: RunConfig, weights: WeightsSnapshot, command: Watch, a
         write_video(store, path)
     else:
         episode_strip_png(episode, config.world, path)
-    Console().print(f"{len(episode.action) - 1} env steps, outcome {OUTCOME_NAMES[episode.outcome]}", highlight=False)
+    plain_console().print(f"{len(episode.action) - 1} env steps, outcome {OUTCOME_NAMES[episode.outcome]}")

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from rich.console import Console
-
 from dashboards.pages.server import PageServer
+from deploy.console.terminal import plain_console
 
 
 def serve_until_interrupted(server: PageServer) -> int:
     """Prints the page's URL and serves it until Ctrl-C; returns the exit code 0."""
-    Console().print(f"{server.url}  (Ctrl-C ends it)", highlight=False, soft_wrap=True)
+    plain_console().print(f"{server.url}  (Ctrl-C ends it)", soft_wrap=True)
     try:
         server.serve()
     except KeyboardInterrupt:
-        Console().print("ended", highlight=False)
+        plain_console().print("ended")
     return 0

@@ -60,7 +60,7 @@ class SweepDisplay(PlainOutput):
 
     def print_line(self, text: str) -> None:
         """Prints a line for a log."""
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self._console.print(text, soft_wrap=True)
 
     def failures(self) -> list[str]:
         """One line per failed cell."""

@@ -1,11 +1,20 @@
-"""What displays of progress share."""
+"""The terminal: a console that shows text as it is, and what displays of progress share."""
 
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from rich.console import Console
+
+
+def plain_console(**options: Any) -> Console:
+    """A console that shows text as it is: a path or a name may look like rich's markup or codes of emoji.
+
+    Args:
+      **options: those of rich's Console, such as `stderr` or `file`.
+    """
+    return Console(markup=False, emoji=False, highlight=False, **options)
 
 
 def is_interactive(console: Console) -> bool:

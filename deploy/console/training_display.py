@@ -69,7 +69,7 @@ class PlainDisplay(PlainOutput):
         self._last_s = now_s
         share = row.env_steps / self._total
         line = f"{row.env_steps:,} env steps ({share:.0%})  {self._latest.text()}{self._left(now_s, row.env_steps)}"
-        self._console.print(line, highlight=False, soft_wrap=True)
+        self._console.print(line, soft_wrap=True)
 
     def _left(self, now_s: float, env_steps: int) -> str:
         start_s, start_steps = self._first or (now_s, env_steps)
@@ -80,7 +80,7 @@ class PlainDisplay(PlainOutput):
 
     def message(self, text: str) -> None:
         """Prints a line."""
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self._console.print(text, soft_wrap=True)
 
 
 class LiveDisplay:
@@ -97,9 +97,9 @@ class LiveDisplay:
             BarColumn(bar_width=24),
             TaskProgressColumn(),
             TimeElapsedColumn(),
-            TextColumn("left"),
+            TextColumn("left", markup=False),
             TimeRemainingColumn(),
-            TextColumn("{task.fields[metrics]}"),
+            TextColumn("{task.fields[metrics]}", markup=False),
             console=console,
         )
         self._task = self._progress.add_task("training", total=total_env_steps, metrics="starting")
@@ -123,7 +123,7 @@ class LiveDisplay:
 
     def message(self, text: str) -> None:
         """Prints a line above the bar."""
-        self._progress.console.print(text, markup=False, highlight=False)
+        self._progress.console.print(text)
 
 
 def make_display(console: Console, total_env_steps: int) -> LiveDisplay | PlainDisplay:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from rich.console import Console
-
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import env_shape
+from deploy.console.terminal import plain_console
 from learner.checkpoints.checkpoint import Checkpoint, best_valid, finished_names, newest_valid, valid_named
 from learner.checkpoints.retention import scores_of
 from learner.config import RunConfig
@@ -44,7 +43,7 @@ def _checkpoint(folder: RunFolder, which: str) -> Checkpoint:
     scores = scores_of(read_rows(folder.journal)) if which == BEST else None
     checkpoint, skipped = newest_valid(root) if scores is None else best_valid(root, scores)
     for reason in skipped:
-        Console(stderr=True).print(f"skipped: {reason}", markup=False, highlight=False, soft_wrap=True)
+        plain_console(stderr=True).print(f"skipped: {reason}", soft_wrap=True)
     return checkpoint
 
 

@@ -1,4 +1,4 @@
-"""What no source of ours may do: read pickle, or hand anything to a shell."""
+"""What no source of ours may do: read pickle, hand anything to a shell, or print a name as rich's markup."""
 
 import ast
 from pathlib import Path
@@ -36,6 +36,18 @@ def test_no_pickle_and_no_shell(path):
         if name.startswith("subprocess.") and name.split(".")[1] in RUNNERS:
             assert keywords.get("shell", "False") == "False"
             assert not isinstance(call.args[0], ast.Constant | ast.JoinedStr), "a list of words, not a line for a shell"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_consoles_show_text_as_it_is(path):
+    """Every console is a `plain_console`, and no text is made from markup, which rich always reads in a status."""
+    calls = calls_of(ast.parse(path.read_text("utf-8")))
+    names = {name for _, name in calls}
+    made_here = {"Console"} if path == ROOT / "deploy" / "console" / "terminal.py" else set()
+    read_markup = {name for name in names if name.split(".")[-1] in ("Console", "from_markup", "get_console")}
+    assert read_markup == made_here
+    statuses = [call.args for call, name in calls if name.endswith(".status")]
+    assert all(isinstance(each, ast.Constant) for arguments in statuses for each in arguments)
 
 
 def test_there_are_sources():

@@ -125,8 +125,8 @@ def test_an_unreachable_tracking_server_is_refused_at_the_start(capsys, tmp_path
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The runs folder of one small finished run named `r`."""
-    runs = tmp_path_factory.mktemp("cli") / "runs"
+    """The runs folder of one small finished run named `r`; its name looks like rich's markup."""
+    runs = tmp_path_factory.mktemp("cli") / "runs[/x]"
     assert main(["train", "--runs-dir", str(runs), "--name", "r", *flags(SMALL)]) == 0
     return runs
 

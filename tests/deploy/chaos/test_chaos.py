@@ -6,12 +6,12 @@ import sys
 
 import psutil
 import pytest
-from rich.console import Console
 
 from deploy.chaos.config import write_config
 from deploy.chaos.faults import FULL, KINDS, MLFLOW, FaultKind, InjectedFault, fault_table, with_recovery
 from deploy.chaos.processes import fill_disk
 from deploy.cli import main, read_config_file
+from deploy.console.terminal import plain_console
 from learner.tracking.fault_log import DRIVER, FaultEntry
 
 
@@ -60,7 +60,7 @@ def test_unrecovered_faults_and_delays_have_no_recovery_time():
 
 def test_the_table_counts_faults_and_gives_median_and_maximum():
     faults = [fault("killed", "learner", 0.0)._replace(recovery_s=seconds) for seconds in (1.0, 9.0, 2.0)]
-    console = Console(width=100, record=True, file=io.StringIO())
+    console = plain_console(width=100, record=True, file=io.StringIO())
     console.print(fault_table([*faults, fault("delayed", "learner", 0.0)]))
     rows = [
         [cell.strip() for cell in line.split("│")[1:-1]] for line in console.export_text().splitlines() if "│" in line

@@ -3,11 +3,11 @@
 import io
 
 import pytest
-from rich.console import Console
 
 from actors.evaluation.result_table import ResultRow
 from deploy.console import sweep_display
 from deploy.console.sweep_display import LiveSweepDisplay, SweepDisplay, make_sweep_display
+from deploy.console.terminal import plain_console
 from learner.sweep.grid import SweepConfig, make_cells
 
 SWEEP = SweepConfig(methods=("sensor",), robots=(5,), groups=(1, 2), seeds=(0, 1), baselines=("greedy",))
@@ -23,12 +23,12 @@ def rows(goal, episodes=100):
 
 
 def display_of(done=None, kind=SweepDisplay):
-    console = Console(file=io.StringIO(), width=120)
+    console = plain_console(file=io.StringIO(), width=120)
     return kind(console, CELLS, done or {}), console
 
 
 def text_of(display):
-    console = Console(file=io.StringIO(), width=120)
+    console = plain_console(file=io.StringIO(), width=120)
     console.print(display.table())
     return console.file.getvalue()
 
@@ -87,5 +87,7 @@ def test_a_log_gets_one_line_per_cell_and_a_terminal_the_table():
     assert terminal.file.getvalue() == ""
     with live:
         pass
-    assert type(make_sweep_display(Console(file=io.StringIO()), CELLS, {})) is SweepDisplay
-    assert type(make_sweep_display(Console(file=io.StringIO(), force_terminal=True), CELLS, {})) is LiveSweepDisplay
+    assert type(make_sweep_display(plain_console(file=io.StringIO()), CELLS, {})) is SweepDisplay
+    assert (
+        type(make_sweep_display(plain_console(file=io.StringIO(), force_terminal=True), CELLS, {})) is LiveSweepDisplay
+    )

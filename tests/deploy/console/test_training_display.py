@@ -3,9 +3,9 @@
 import io
 
 import pytest
-from rich.console import Console
 
 from deploy.console import training_display
+from deploy.console.terminal import plain_console
 from deploy.console.training_display import LatestMetrics, LiveDisplay, PlainDisplay, make_display
 from learner.tracking.journal import Row
 
@@ -14,7 +14,7 @@ SPEEDS = {"speed/env_steps_per_s": 12345.6, "speed/updates_per_s": 78.9}
 
 def make_console(terminal=False, term="xterm-256color"):
     environment = {"TERM": term, "COLUMNS": "160"}
-    return Console(file=io.StringIO(), force_terminal=terminal, width=160, height=20, _environ=environment)
+    return plain_console(file=io.StringIO(), force_terminal=terminal, width=160, height=20, _environ=environment)
 
 
 def lines(console):
@@ -120,7 +120,7 @@ def test_the_live_display_shows_success_speeds_and_time_left():
         display.row(row(0))
         display.row(row(250, eval__success_rate=0.5, train__success_rate=0.25))
         display.message("a checkpoint")
-        text = Console(file=io.StringIO(), width=160)
+        text = plain_console(file=io.StringIO(), width=160)
         text.print(display._progress.get_renderable())
     drawn = text.file.getvalue()
     for part in ("25%", "eval success 50%", "train success 25%", "12,346 env steps/s", "79 updates/s", "left"):
