@@ -45,6 +45,8 @@ class WorldConfig:
     """A timeout cuts and keeps the state's value, or fails with -tau (M_sensor: cuts; M_IN, M_OUT: Alg. 4.1, 4.2)."""
     captured_is: Literal["among", "surrounded"] = "among"
     """Captured, not lost: senses other groups' robots and no own one, or is also inside their convex hull (3.3)."""
+    group_distance: Literal["mean", "centroid"] = "mean"
+    """A group's distance to its goal (Eq. 3.2, which prints no norm): the mean of its robots', or its centroid's."""
 
     sectors: int = 8
     """q, the number of sectors per sensing region and of headings (not given in the text)."""
@@ -73,6 +75,8 @@ class WorldConfig:
 
     outside_limit_steps: int = 100
     """`in`, `out`: phi, simulator steps outside the own ellipse in a row that fail (not given in the text)."""
+    lost_ends_episode: bool = False
+    """`in`, `out`: whether an episode also ends once no own robot is within R2 (row "Lost" of Table 4.1)."""
     ellipse_covariance: Literal["diagonal", "full"] = "diagonal"
     """`in`, `out`: covariance of a group's positions, with sigma_xy = 0 (4.2.1) or with all of it."""
     ellipse_axes: Literal["confidence", "printed"] = "confidence"
@@ -128,6 +132,9 @@ class WorldConfig:
 
     flocking: Literal["published", "uniform", "none"] = "published"
     """FL-ORCA weights: the published table per state, one weight per term in all states, or ORCA alone."""
+    state_machine: Literal["published", "text"] = "published"
+    """When a robot is in which state of Figure 2.2: as published, or as in the text: Single Group whenever it sees no
+    other group, Follower of robots in the first two states alone."""
     separation_range_m: float = 0.395
     """`published`: other groups' robots within this range are separated from."""
     separation_angle_deg: float = 45.0

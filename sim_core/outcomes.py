@@ -1,12 +1,13 @@
 """How an episode ends: mutually exclusive outcomes, defined once for every method.
 
 Spec of the task (3.1, 4.1): success is the mean distance of the learning robot's group to its goal
-(Eq. 3.2) below R2. Failures are told apart as lost and captured (Figure 3.3), collision and timeout.
+(Eq. 3.2; `group_distance`) below R2. Failures are told apart as lost and captured (Figure 3.3), collision and timeout.
 Where two hold in one step, the first of collision, goal, lost or captured, timeout counts.
 
 M_sensor fails as soon as the learning robot senses no own robot, M_IN and M_OUT once it has been outside its
-group's ellipse for phi steps. A robot that fails in this way is captured if it senses, within R2, robots of other
-groups and none of its own; else it is lost. With `captured_is = surrounded` those others must also stand around it.
+group's ellipse for phi steps (with `lost_ends_episode`, at whichever of the two comes first). A robot that fails in
+this way is captured if it senses, within R2, robots of other groups and none of its own; else it is lost. With
+`captured_is = surrounded` those others must also stand around it.
 """
 
 from __future__ import annotations
@@ -59,8 +60,13 @@ def sensed(robot, begin, end, pos_x, pos_y, range_sq):
 
 
 @kernel
-def group_goal_distance_m(begin, end, pos_x, pos_y, goal_x, goal_y):
-    """Mean distance of the robots begin..end-1 to the point (goal_x, goal_y) (Eq. 3.2), metres."""
+def group_goal_distance_m(begin, end, pos_x, pos_y, goal_x, goal_y, of_centroid):
+    """Mean distance of the robots begin..end-1 to the point (goal_x, goal_y), or their centroid's (Eq. 3.2), metres."""
+    if of_centroid:
+        sum_x, sum_y = 0.0, 0.0
+        for i in range(begin, end):
+            sum_x, sum_y = sum_x + (pos_x[i] - goal_x), sum_y + (pos_y[i] - goal_y)
+        return np.sqrt(sum_x * sum_x + sum_y * sum_y) / (end - begin)
     total = 0.0
     for i in range(begin, end):
         dx, dy = pos_x[i] - goal_x, pos_y[i] - goal_y
@@ -69,14 +75,14 @@ def group_goal_distance_m(begin, end, pos_x, pos_y, goal_x, goal_y):
 
 
 @kernel
-def collision_or_goal(robot, begin, end, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m):
+def collision_or_goal(robot, begin, end, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m, of_centroid):
     """COLLISION or GOAL where one holds after a step, else RUNNING; the same for every method.
 
-    The robot's group are the robots begin..end-1, its goal is (goal_x, goal_y).
+    The robot's group are the robots begin..end-1, its goal is (goal_x, goal_y); `of_centroid` as `group_distance` says.
     """
     if collides(robot, pos_x, pos_y, collision_sq):
         return _COLLISION
-    if group_goal_distance_m(begin, end, pos_x, pos_y, goal_x, goal_y) < range_m:
+    if group_goal_distance_m(begin, end, pos_x, pos_y, goal_x, goal_y, of_centroid) < range_m:
         return _GOAL
     return _RUNNING
 
@@ -115,9 +121,9 @@ def lost_or_captured(robot, begin, end, pos_x, pos_y, range_sq, must_surround):
 
 
 @kernel
-def end_of_step(robot, begin, end, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m, must_surround):
+def end_of_step(robot, begin, end, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m, of_centroid, must_surround):
     """Outcome of one world after a step of a robot that is lost once it senses no own robot."""
-    ended = collision_or_goal(robot, begin, end, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m)
+    ended = collision_or_goal(robot, begin, end, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m, of_centroid)
     if ended != _RUNNING:
         return ended
     range_sq = range_m * range_m

@@ -41,8 +41,10 @@ class EpisodeParams(NamedTuple):
     outer_m: Any
     outer_sq: Any
     collision_sq: Any
+    of_centroid: bool
     must_surround: bool
     outside_limit_steps: int
+    lost_ends: bool
     horizon_steps: int
     timeout_fails: bool
     reward_scale: float
@@ -57,8 +59,10 @@ def episode_params(config: WorldConfig) -> EpisodeParams:
         outer_m=real(config.outer_radius_m),
         outer_sq=real(config.outer_radius_m) ** 2,
         collision_sq=real(2 * config.robot_radius_m) ** 2,
+        of_centroid=config.group_distance == "centroid",
         must_surround=config.captured_is == "surrounded",
         outside_limit_steps=config.outside_limit_steps,
+        lost_ends=config.lost_ends_episode,
         horizon_steps=config.horizon_steps,
         timeout_fails=config.timeout_fails,
         reward_scale=float(config.reward_scale),
@@ -84,6 +88,7 @@ def _outcome(state, mask, out, params):
             state.goal_y[world, group],
             p.collision_sq,
             p.outer_m,
+            p.of_centroid,
             p.must_surround,
         )
         if ended == _RUNNING and state.steps[world] >= p.horizon_steps:

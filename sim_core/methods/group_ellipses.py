@@ -6,7 +6,8 @@ learning robot, in the world's frame, which is the frame of the headings. Length
 order around the start circle, or by the distance of their centres.
 
 The episode fails where the learning robot has been outside its own ellipse for phi steps running: 4.2.1 and 4.2.3 name
-this, the collision and the goal as terminal. The row "Lost" of Table 4.1 is read as just that.
+this, the collision and the goal as terminal. Table 4.1 has a row "Lost / Collision" beside "Outside ellipse for phi
+steps": with `lost_ends_episode` a robot with none of its own within R2 fails at once, too.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from sim_core.methods.ellipse import (
 from sim_core.methods.headings import heading_velocities
 from sim_core.methods.m_sensor import WORLD as SWARM_WORLD
 from sim_core.methods.progress import came_closer
-from sim_core.outcomes import Outcome, collision_or_goal, lost_or_captured
+from sim_core.outcomes import Outcome, collision_or_goal, lost_or_captured, sensed
 from sim_core.packed import packed
 from sim_core.state import WorldState, own_group
 
@@ -126,8 +127,14 @@ def _outcome(state, mask, out, params):
         inside = in_own_ellipse(learner, begin, end, pos_x, pos_y, p.ellipse)
         state.outside_steps[world] = 0 if inside else state.outside_steps[world] + 1
         goal_x, goal_y = state.goal_x[world, group], state.goal_y[world, group]
-        ended = collision_or_goal(learner, begin, end, pos_x, pos_y, goal_x, goal_y, e.collision_sq, e.outer_m)
-        if ended == _RUNNING and state.outside_steps[world] >= e.outside_limit_steps:
+        ended = collision_or_goal(
+            learner, begin, end, pos_x, pos_y, goal_x, goal_y, e.collision_sq, e.outer_m, e.of_centroid
+        )
+        away = state.outside_steps[world] >= e.outside_limit_steps
+        if ended == _RUNNING and e.lost_ends and not away:
+            own, _ = sensed(learner, begin, end, pos_x, pos_y, e.outer_sq)
+            away = own == 0
+        if ended == _RUNNING and away:
             ended = lost_or_captured(learner, begin, end, pos_x, pos_y, e.outer_sq, e.must_surround)
         if ended == _RUNNING and state.steps[world] >= e.horizon_steps:
             ended = _TIMEOUT
@@ -248,7 +255,7 @@ class EllipseMethod(Method):
         _perceive(state, mask, out, self._order, self._distance_sq, self._params)
 
     def outcome(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
-        """4.2.1: goal, collision, lost or captured after phi steps outside, timeout; counts `outside_steps`."""
+        """4.2.1: goal, collision, lost or captured (see `lost_ends_episode`), timeout; counts `outside_steps`."""
         _outcome(state, mask, out, self._params)
 
     def reward(

@@ -18,7 +18,8 @@ SINGLE_GROUP, VISION_FREE, FOLLOWER, TURN_RIGHT = 0, 1, 2, 3
 STATE_NAMES = ("single group", "vision free", "follower", "turn right")
 
 SEES_OTHER_GROUP, VIEW_FREE, FOLLOWER_LEVEL_1, FOLLOWER_LEVEL_2 = 1, 2, 4, 8
-"""Bits of a robot's flags. A level-1 follower follows a robot with a free view, a level-2 follower a level-1 one."""
+"""Bits of a robot's flags. A level-1 follower follows a robot with a free view, a level-2 follower a level-1 one.
+In the text's state machine a robot that sees no other group counts as one with a free view; nobody is of level 2."""
 
 NO_FLOCK, PUBLISHED, UNIFORM = range(3)
 """Rule sets: no flocking, straight to the goal; the published weights; one weight per term."""
@@ -42,6 +43,7 @@ class FlockParams(NamedTuple):
     """Flocking constants in the worlds' dtype; weights `[4, 2, 8]` as of `flock_weights`."""
 
     rules: int
+    follows_text: bool
     weights: Any
     separation_range_sq: Any
     separation_cos: Any
@@ -82,6 +84,7 @@ def flock_params(config: WorldConfig, dtype: Any) -> FlockParams:
 
     return FlockParams(
         rules=("none", "published", "uniform").index(config.flocking),
+        follows_text=config.state_machine == "text",
         weights=flock_weights(config, dtype),
         separation_range_sq=real(config.separation_range_m) ** 2,
         separation_cos=cosine(config.separation_angle_deg),

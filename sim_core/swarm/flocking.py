@@ -11,6 +11,10 @@ computed in passes over the whole tile, and no pass changes a flag that it reads
 3. level-2 followers: their own view is not free, no flockmate's is, and a flockmate is a level-1 follower.
 
 Flockmates are a robot's neighbours of its own group.
+
+In the text's state machine (`state_machine`), a robot that sees no other group is in the state Single Group whatever
+blocks its view: the first pass counts that view as free, so that a level-1 follower follows a robot in one of the first
+two states. The third pass is left out.
 """
 
 from __future__ import annotations
@@ -107,6 +111,8 @@ def sense_neighbours(row, start, tile, f):
             near = present & (dist_m > f.zero) & (dist_m < f.uniform_separation_range_m)
             push = f.one / dist_m - f.one / f.uniform_separation_range_m
             sep_x, sep_y = sep_x - select(near, push * dx, zero), sep_y - select(near, push * dy, zero)
+    if f.follows_text:
+        view_free = view_free | ~sees
     scatter(tile.flags, robot, select(sees, SEES_OTHER_GROUP, splat(0)) | select(view_free, VIEW_FREE, splat(0)))
     some = num_flockmates > f.zero
     coh_x, coh_y = clip_norm(select(some, coh_x / num_flockmates, zero), select(some, coh_y / num_flockmates, zero), f)

@@ -143,8 +143,9 @@ def run_flocking_passes(tile_index, rows, tile, rng, p):
         clear_leaders(row, tile)
     for row in range(rows):
         mark_followers(row, VIEW_FREE, FOLLOWER_LEVEL_1, tile)
-    for row in range(rows):
-        mark_followers(row, FOLLOWER_LEVEL_1, FOLLOWER_LEVEL_2, tile)
+    if not p.flock.follows_text:
+        for row in range(rows):
+            mark_followers(row, FOLLOWER_LEVEL_1, FOLLOWER_LEVEL_2, tile)
 
 
 @inlined

@@ -23,12 +23,13 @@ FAR = 50.0
 ROBOT, MATE, OTHER_A, OTHER_B = range(4)
 
 
-def outcome(pos, goal=(FAR, FAR), robot=ROBOT, must_surround=False):
+def outcome(pos, goal=(FAR, FAR), robot=ROBOT, must_surround=False, of_centroid=False):
     """Outcome of two groups of two (robots 0, 1 and 2, 3)."""
     pos_x, pos_y = np.ascontiguousarray(np.asarray(pos, REAL).T)
     begin = robot // 2 * 2
     x, y = (REAL(goal[0]), REAL(goal[1])) if begin == 0 else (REAL(-FAR), REAL(-FAR))
-    ended = end_of_step(robot, begin, begin + 2, pos_x, pos_y, x, y, REAL(CONTACT_M) ** 2, REAL(RANGE_M), must_surround)
+    limits = REAL(CONTACT_M) ** 2, REAL(RANGE_M)
+    ended = end_of_step(robot, begin, begin + 2, pos_x, pos_y, x, y, *limits, of_centroid, must_surround)
     return Outcome(ended)
 
 
@@ -92,7 +93,7 @@ def test_edges_are_open():
     assert outcome([(0.5, 0), (2.49, 0), (0, 9), (0, -9)], goal=(0, 0)) is Outcome.GOAL
 
 
-def test_mean_goal_distance_matches_numpy():
+def test_goal_distance_of_a_group_matches_numpy():
     rng = np.random.default_rng(0)
     for _ in range(50):
         robots, groups = int(rng.integers(2, 26)), int(rng.integers(1, 9))
@@ -100,9 +101,19 @@ def test_mean_goal_distance_matches_numpy():
         goal = rng.normal(0, 5, (groups, 2)).astype(REAL)
         for g in range(groups):
             own = pos[g * robots : (g + 1) * robots].astype(np.float64)
-            expected = np.linalg.norm(own - goal[g], axis=1).mean()
-            args = (*np.ascontiguousarray(pos.T), *goal[g])
-            assert group_goal_distance_m(g * robots, (g + 1) * robots, *args) == pytest.approx(expected, rel=1e-6)
+            expected = {False: np.linalg.norm(own - goal[g], axis=1).mean()}
+            expected[True] = np.linalg.norm(own.mean(axis=0) - goal[g])
+            for of_centroid, distance_m in expected.items():
+                args = (*np.ascontiguousarray(pos.T), *goal[g], of_centroid)
+                found = group_goal_distance_m(g * robots, (g + 1) * robots, *args)
+                assert found == pytest.approx(distance_m, rel=1e-6, abs=1e-6)
+
+
+def test_a_group_around_its_goal_is_there_by_its_centroid_alone():
+    spread = [(-2.0, 0), (2.0, 0), (0, 9), (0, -9)]
+    assert outcome(spread, goal=(0, 0)) is Outcome.LOST
+    assert outcome(spread, goal=(0, 0), of_centroid=True) is Outcome.GOAL
+    assert outcome(spread, goal=(1.5, 0), of_centroid=True) is Outcome.LOST  # the edge is open
 
 
 def test_sensing_and_contact_match_numpy():
@@ -153,7 +164,8 @@ def learner_and(others):
 def test_captured_may_have_to_be_surrounded(others, expected):
     pos_x, pos_y = learner_and(others)
     assert lost_or_captured(0, 0, 3, pos_x, pos_y, REAL(RANGE_M) ** 2, True) == Outcome[expected]
-    ended = end_of_step(0, 0, 3, pos_x, pos_y, REAL(FAR), REAL(FAR), REAL(CONTACT_M) ** 2, REAL(RANGE_M), True)
+    limits = REAL(CONTACT_M) ** 2, REAL(RANGE_M)
+    ended = end_of_step(0, 0, 3, pos_x, pos_y, REAL(FAR), REAL(FAR), *limits, False, True)
     assert ended == Outcome[expected]
 
 
@@ -185,7 +197,8 @@ def test_surrounded_is_inside_the_convex_hull():
 def test_collision_or_goal_knows_nothing_of_lost():
     for mate, expected in ((2.9, "GOAL"), (3.1, "RUNNING"), (0.1, "COLLISION")):
         pos_x, pos_y = np.array([0, mate, 9, -9], REAL), np.array([0, 0, 9, -9], REAL)
-        found = collision_or_goal(ROBOT, 0, 2, pos_x, pos_y, REAL(0), REAL(0), REAL(CONTACT_M) ** 2, REAL(RANGE_M))
+        limits = REAL(CONTACT_M) ** 2, REAL(RANGE_M)
+        found = collision_or_goal(ROBOT, 0, 2, pos_x, pos_y, REAL(0), REAL(0), *limits, False)
         assert found == Outcome[expected]
 
 

@@ -248,6 +248,23 @@ def test_lost_and_captured_at_phi(at, others, expected, make_state):
     assert reward == pytest.approx(0.01 if expected is Outcome.RUNNING else -1.0)
 
 
+@pytest.mark.parametrize("method", METHOD_NAMES)
+def test_a_lost_robot_may_end_the_episode_before_phi(method, make_state):
+    """Table 4.1's row "Lost / Collision": no own robot within R2, whatever the ellipse."""
+    settings = {"outside_limit_steps": 100, "lost_ends_episode": True, "ellipse_axes": "printed"}
+    config, state = scene(make_state, (2.0, 1.0), AWAY, method, **settings)
+    mates = np.hypot(state.pos_x[0, 1 : config.robots] - 2.0, state.pos_y[0, 1 : config.robots] - 1.0)
+    assert mates.min() < config.outer_radius_m
+    assert step(config, state)[0] is Outcome.RUNNING and state.outside_steps[0] == 1  # outside, but it senses a mate
+    for others, expected in ((AWAY, Outcome.LOST), (NEAR_6, Outcome.CAPTURED)):
+        config, state = scene(make_state, (6, 0), others, method, **settings)
+        assert step(config, state) == (expected, -1)
+        config, state = scene(make_state, (6, 0), others, method, outside_limit_steps=100)
+        assert step(config, state)[0] is Outcome.RUNNING
+    config, state = scene(make_state, (6, 0), [(6.1, 0), *AWAY[1:]], method, **settings)
+    assert step(config, state) == (Outcome.COLLISION, -1)
+
+
 AROUND_6 = [(6.5, 0.5), (6.5, -0.5), (5.3, 0), *AWAY[3:]]
 
 

@@ -35,9 +35,11 @@ class Oracle:
         blocked = self.blocked_published if config.flocking == "published" else self.blocked_uniform
         self.sees = {i for i in robots if self.sees_other_group(i)}
         self.free = {i for i in robots if not blocked(i)}
-        self.level_1 = {i for i in robots if i not in self.free and self.free & set(self.flockmates[i])}
+        self.text = config.state_machine == "text"
+        self.first_two = {i for i in robots if i not in self.sees or i in self.free} if self.text else self.free
+        self.level_1 = {i for i in set(robots) - self.first_two if self.first_two & set(self.flockmates[i])}
         self.level_2 = {i for i in set(robots) - self.free - self.level_1 if self.level_1 & set(self.flockmates[i])}
-        self.followers = self.level_1 | self.level_2
+        self.followers = self.level_1 if self.text else self.level_1 | self.level_2
 
     def less(self, value, limit):
         """value < limit; `clear` becomes false if that is too close to call."""
@@ -81,12 +83,24 @@ class Oracle:
         return any(blocks)
 
     def leader(self, i):
-        wanted = self.free if i in self.level_1 else self.level_1
+        wanted = self.first_two if i in self.level_1 else self.level_1
         candidates = sorted((np.hypot(*self.to_goal[j]), j) for j in self.flockmates[i] if j in wanted)
         self.clear &= len(candidates) < 2 or candidates[1][0] - candidates[0][0] > MARGIN
         return candidates[0][1]
 
     def state(self, i):
+        return self.state_of_text(i) if self.text else self.state_as_published(i)
+
+    def state_of_text(self, i):
+        """The table of Figure 2.2, line by line."""
+        if i not in self.sees:
+            return SINGLE_GROUP
+        if i in self.free:
+            return VISION_FREE
+        unled = all(j in self.sees and j not in self.free for j in self.flockmates[i])
+        return TURN_RIGHT if unled else FOLLOWER
+
+    def state_as_published(self, i):
         if i in self.free:
             return VISION_FREE if i in self.sees else SINGLE_GROUP
         if i in self.followers:
@@ -129,9 +143,10 @@ class Oracle:
         return unit(total)
 
 
+@pytest.mark.parametrize("machine", ["published", "text"])
 @pytest.mark.parametrize("rules", ["published", "uniform"])
-def test_random_scenes_match_the_rules(rules, make_flock):
-    config = WorldConfig(robots=ROBOTS, groups=GROUPS, separation_noise=0.0, flocking=rules)
+def test_random_scenes_match_the_rules(rules, machine, make_flock):
+    config = WorldConfig(robots=ROBOTS, groups=GROUPS, separation_noise=0.0, flocking=rules, state_machine=machine)
     rng = np.random.default_rng(5)
     compared, states = 0, np.zeros(4, int)
     for _ in range(160):
