@@ -177,7 +177,7 @@ def _module(kind: Kind, file_name: str, source: str) -> ModuleType:
 
 def _materialised(file_name: str, source: str, digest: str) -> Path:
     """A file with the text of a user's own, in a folder that is named by its content."""
-    from sim_core.jit import CACHE_FOLDER
+    from sim_core.kernel_cache import CACHE_FOLDER
 
     path = Path(CACHE_FOLDER) / "plugins" / digest / file_name
     if not path.is_file():  # a file that is written anew would void the kernels that numba keeps of it
