@@ -19,6 +19,8 @@ ROBOTS = (5, 10, 15, 20, 25)
 """Robots per group of the dissertation's setups (3.3)."""
 GROUPS = (1, 2, 3, 4, 8)
 """Group counts of the dissertation's setups (3.3)."""
+DRAWN_TRAININGS = ((5, 1), (10, 1), (5, 2), (5, 3), (10, 2), (10, 3))
+"""Robots per group and groups of the trainings whose Extrapolation Figures 3.4 to 3.6 draw (M_sensor)."""
 LEARNED = "learned"
 """`policy` of a trained network; a baseline's is its name."""
 
@@ -56,6 +58,13 @@ class ResultRow(NamedTuple):
     def is_fixed(self) -> bool:
         """Whether training and evaluation have the same setup (Fixed); otherwise it is an Extrapolation."""
         return (self.trained_robots, self.trained_groups) == (self.robots, self.groups)
+
+
+def is_drawn(trained: tuple[int, int], played: tuple[int, int]) -> bool:
+    """Whether a figure draws the Extrapolation from one setup (robots, groups) to another: to more of either."""
+    more_robots = played[0] > trained[0] and played[1] == trained[1]
+    more_groups = played[1] > trained[1] and played[0] == trained[0]
+    return trained in DRAWN_TRAININGS and (more_robots or more_groups)
 
 
 _TYPES: dict[str, Any] = get_type_hints(ResultRow)

@@ -15,9 +15,11 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import norm
 
 from actors.evaluation import statistics as estimates
 from actors.evaluation.result_table import GROUPS, LEARNED, ROBOTS, ResultRow
@@ -94,6 +96,12 @@ class PooledCell:
         failed = self.episodes - self.count(Outcome.GOAL)
         return Measurement(rate(failed, self.episodes, self._factor(Outcome.GOAL)), self.episodes, len(self.rows))
 
+    def failures_but_lost(self) -> Measurement:
+        """Share of episodes that end neither in the goal nor lost."""
+        others = [outcome for outcome in ENDED if outcome not in (Outcome.GOAL, Outcome.LOST)]
+        count, factor = sum(map(self.count, others)), max(map(self._factor, others))
+        return Measurement(rate(count, self.episodes, factor), self.episodes, len(self.rows))
+
     def _factor(self, outcome: Outcome) -> float:
         return self.overdispersion.get(outcome, 1.0) if len(self.rows) > 1 else 1.0
 
@@ -138,11 +146,16 @@ def _overdispersion(cells: Sequence[Sequence[ResultRow]]) -> dict[Outcome, float
 class Results:
     """Results of one preset's learned policies, pooled over seeds, by method and setup.
 
+    Args:
+      rows: its rows; those of baselines are left out.
+      variants: results of the preset with settings that override it, by the settings.
+
     Raises:
       ConfigError: two rows hold the same policy in the same setup.
     """
 
-    def __init__(self, rows: Iterable[ResultRow]) -> None:
+    def __init__(self, rows: Iterable[ResultRow], variants: Mapping[str, Results] = MappingProxyType({})) -> None:
+        self.variants = variants
         found: dict[tuple[str, Setup, Setup], list[ResultRow]] = {}
         for row in sorted(rows):
             if row.policy == LEARNED:
@@ -230,6 +243,16 @@ def weighted_sum(weighted: Sequence[tuple[float, Measurement | None]]) -> Measur
 def difference(first: Measurement | None, second: Measurement | None) -> Measurement | None:
     """`first` minus `second`; None if one is missing."""
     return weighted_sum([(1.0, first), (-1.0, second)])
+
+
+def for_comparisons(measurement: Measurement | None, comparisons: int) -> Measurement | None:
+    """The quantity with an interval for one of so many comparisons (Bonferroni), by the normal quantiles' ratio."""
+    if measurement is None:
+        return None
+    value, low, high = measurement.estimate
+    wider = float(norm.ppf(1 - 0.025 / comparisons) / norm.ppf(0.975))
+    estimate = Estimate(value, value - wider * (value - low), value + wider * (high - value))
+    return measurement._replace(estimate=estimate)
 
 
 def average(terms: Sequence[Measurement | None]) -> Measurement | None:

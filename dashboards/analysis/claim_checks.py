@@ -3,9 +3,13 @@
 All tolerances of the claims are defined here:
 
 - `≈ x %` of a success rate, read from a bar chart: within 10 points of x. Of a failure rate: within 2 points.
-- "at least as good", "flat", "similar": differs by at most 2 points.
+- "flat", "similar": differs by at most 2 points.
 - "none": at most 0.5 %, which is printed as 0 %.
-- "decays fast": falls by at least 20 points from 1 to 8 groups. (The text calls smooth what stays above 80 %.)
+- "decays fast": falls by more than with 10 and 15 robots do in the mean, whose decay the text calls smoother.
+- "outperforms" in every setup: the value is higher. Where both rates are at least 95 %, the text's bars cannot be told
+  apart: there the other may be higher by 2 points. It fails only where the interval for all comparisons together
+  (Bonferroni) is below.
+- "almost every": at least 80 %. "does not vanish": at least half. "close to zero": at most 10 %.
 
 A check holds if its whole 95 % interval lies in the range, fails if none of it does, and is undecided otherwise.
 `≈` and "around" are judged by the value alone: they hold if the value lies in the range, fail if the whole interval
@@ -21,13 +25,18 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from actors.evaluation.statistics import Estimate, as_percent
-from dashboards.analysis.aggregate import Measurement, Setup
+from dashboards.analysis.aggregate import Measurement, Setup, difference, for_comparisons
 
 ABOUT = 0.10
 ABOUT_FAILURE = 0.02
 ALIKE = 0.02
 NONE = 0.005
-FAST = 0.20
+NEAR_ALL = 0.95
+ALMOST_EVERY = 0.80
+NOT_VANISHED = 0.50
+CLOSE_TO_ZERO = 0.10
+NUM_CLAIMS = 15
+"""Claims of the dissertation; those with higher numbers are further statements."""
 
 
 class Verdict(enum.StrEnum):
@@ -44,7 +53,7 @@ class Check(NamedTuple):
 
     Fields: name, short and unique in its claim; the range in words; the measured quantity, None without data; its
     limits; whether the value alone decides (`≈`); whether the quantity is a difference, shown in points; the setup of
-    the check, if the claim is about every setup.
+    the check, if the claim is about every setup; what would give data that no table of results holds.
     """
 
     name: str
@@ -55,6 +64,7 @@ class Check(NamedTuple):
     by_value: bool = False
     is_difference: bool = False
     setup: Setup | None = None
+    needs: str = ""
 
     @property
     def verdict(self) -> Verdict:
@@ -105,9 +115,27 @@ def at_most(name: str, measured: Measurement | None, limit: float) -> Check:
     return Check(name, f"≤ {_plain(limit)} %", measured, high=limit)
 
 
-def rises(name: str, measured: Measurement | None, by: float = 0.0) -> Check:
-    """The difference is greater than `by`."""
-    return Check(name, f"> {_plain(by)} points", measured, low=by, is_difference=True)
+def rises(name: str, measured: Measurement | None) -> Check:
+    """The difference is greater than 0."""
+    return Check(name, "> 0 points", measured, low=0.0, is_difference=True)
+
+
+def outperforms(name: str, first: Measurement | None, second: Measurement | None, comparisons: int) -> Check:
+    """`first` is above `second` by its value, one of so many comparisons; or both are near 100 % and tie."""
+    tie = first is not None and second is not None and min(first.estimate.value, second.estimate.value) >= NEAR_ALL
+    low, wanted = (-ALIKE, f"> −{_plain(ALIKE)} points") if tie else (math.nextafter(0.0, 1.0), "> 0 points")
+    compared = for_comparisons(difference(first, second), comparisons)
+    return Check(name, f"{wanted}, by value", compared, low, by_value=True, is_difference=True)
+
+
+def mostly(name: str, measured: Measurement | None, share: float) -> Check:
+    """By its value, the share of cases is at least `share`."""
+    return Check(name, f"≥ {_plain(share)} % of them, by value", measured, share, by_value=True)
+
+
+def unmeasured(name: str, wanted: str, needs: str) -> Check:
+    """A check of what no table of results holds, and what would measure it."""
+    return Check(name, wanted, None, needs=needs)
 
 
 def no_worse(name: str, measured: Measurement | None) -> Check:
@@ -131,9 +159,9 @@ def as_points(estimate: Estimate) -> str:
 
 
 def number_text(check: Check) -> str:
-    """The measured value with its interval; `–` without data."""
+    """The measured value with its interval; without data `–`, or what would give them."""
     if check.measured is None:
-        return "–"
+        return check.needs or "–"
     return (as_points if check.is_difference else as_percent)(check.measured.estimate)
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
-from dashboards.analysis.claim_checks import Check, Claim, Verdict, number_text, with_verdict
+from dashboards.analysis.claim_checks import NUM_CLAIMS, Check, Claim, Verdict, number_text, with_verdict
+from dashboards.analysis.statements import CONTRADICTIONS
 
 SHOWN_WHOLE = 5
 """The table shows all checks of a claim with at most this many."""
@@ -19,8 +20,9 @@ how much more, estimated over the cells of one method and as many robots (Pearso
 proportional to p(1 − p)). With one seed they speak of that policy alone. All play the same start scenes. A check
 **holds** where its whole interval is in the wanted range, **does not hold** where none of it is, and is
 **undecided** between; `≈` and "around" are met by the value alone (within 10 points, for failure rates within 2).
-"Flat", "similar" and "at least as good" allow 2 points. A claim holds if all its checks hold, and does not if any
-does not."""
+"Flat" and "similar" allow 2 points. In claim 11 the value alone decides, both methods above 95 % tie, and the
+intervals are those of fifty comparisons together (Bonferroni). A claim holds if all its checks hold, and does not if
+any does not. From 16 on these are further statements of the text."""
 
 
 def table_of(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -36,7 +38,13 @@ def verdict_table(claims: Sequence[Claim]) -> list[str]:
 
 
 def tally(claims: Sequence[Claim]) -> str:
-    """The number of claims with each verdict, in one line."""
+    """The number of claims with each verdict, in one line; further statements apart."""
+    further = [claim for claim in claims if claim.number > NUM_CLAIMS]
+    first = _counts([claim for claim in claims if claim.number <= NUM_CLAIMS])
+    return first + (f"; of {len(further)} further statements {_counts(further)}" if further else "")
+
+
+def _counts(claims: Sequence[Claim]) -> str:
     counts = {verdict: sum(claim.verdict is verdict for claim in claims) for verdict in Verdict}
     return ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
 
@@ -83,7 +91,17 @@ def claims_markdown(judged: dict[str, list[Claim]]) -> str:
     for preset, claims in judged.items():
         lines += [f"## Preset {preset}", "", f"{tally(claims).capitalize()}.", "", *verdict_table(claims), ""]
         lines += details(claims)
+    lines += ["## Which contradict each other", "", *contradictions(judged)]
     return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def contradictions(judged: Mapping[str, Sequence[Claim]]) -> list[str]:
+    """Lines of a table: claims of which no world has all, why, and their verdicts with each preset."""
+    rows = []
+    for numbers, why in CONTRADICTIONS:
+        verdicts = ["; ".join(f"{n} {claims[n - 1].verdict}" for n in numbers) for claims in judged.values()]
+        rows.append((", ".join(map(str, numbers)), why, *verdicts))
+    return table_of(("claims", "why no world has all", *judged), rows)
 
 
 def _strong(verdict: Verdict) -> str:

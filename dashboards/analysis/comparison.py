@@ -19,6 +19,15 @@ def presets_of(rows: Sequence[ResultRow]) -> list[str]:
     return sorted({row.preset for row in rows if row.policy == LEARNED}, key=lambda name: (name != "thesis", name))
 
 
+def results_of(rows: Sequence[ResultRow]) -> dict[str, Results]:
+    """The results of each preset, in the order of `presets_of`; a preset knows those of its variants among them."""
+    names, found = presets_of(rows), dict[str, Results]()
+    for name in sorted(names, key=len, reverse=True):  # variants have longer names than what they vary
+        variants = {other.removeprefix(f"{name}+"): found[other] for other in found if other.startswith(f"{name}+")}
+        found[name] = Results((row for row in rows if row.preset == name), variants)
+    return {name: found[name] for name in names}
+
+
 def baselines_of(rows: Sequence[ResultRow]) -> dict[str, Results]:
     """The results of each baseline, by its name."""
     names = sorted({row.policy for row in rows} - {LEARNED})

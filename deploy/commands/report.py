@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from actors.evaluation.result_table import read_table
-from dashboards.analysis.aggregate import Results
 from dashboards.analysis.claim_text import claims_markdown, tally
 from dashboards.analysis.claims import judge
-from dashboards.analysis.comparison import baselines_of, presets_of
+from dashboards.analysis.comparison import baselines_of, results_of
 from dashboards.figures.result_figures import PICTURES
 from dashboards.figures.style import save_png
 from dashboards.report import DRAWINGS, PresetSection, report_markdown
@@ -32,13 +31,12 @@ def run(command: Report) -> int:
     """
     tables = command.results
     rows = list(dict.fromkeys(row for table in tables for row in read_table(table)))  # sweeps may share baselines
-    presets = presets_of(rows)
+    presets = results_of(rows)
     require(bool(presets), f"{', '.join(map(str, tables))} holds no results of a learned policy; run a sweep first")
     sections = []
-    for preset in presets:
+    for preset, results in presets.items():
         own = [row for row in rows if row.preset == preset]
         folder = f"{_folder_name(preset)}/" if len(presets) > 1 else ""
-        results = Results(own)
         sections.append(PresetSection(preset, results, judge(results), folder, baselines_of(own)))
     make_folder(command.out, "--out")
     _write(command.out, tables, sections)

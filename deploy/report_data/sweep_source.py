@@ -10,7 +10,7 @@ from actors.evaluation.result_table import ResultRow, read_table
 from dashboards.analysis.aggregate import CELLS_PER_METHOD, Results
 from dashboards.analysis.claim_text import tally
 from dashboards.analysis.claims import judge
-from dashboards.analysis.comparison import BASELINES_NOTE, baselines_of, comparison_rows, presets_of
+from dashboards.analysis.comparison import BASELINES_NOTE, baselines_of, comparison_rows, results_of
 from dashboards.pages.report_page import ReportContents, TableSection
 from dashboards.plotly_charts.chart import Chart, Table
 from dashboards.plotly_charts.result_charts import failure_causes, heatmaps, transfers
@@ -60,7 +60,7 @@ class SweepSource:
     def contents(self) -> ReportContents:
         """The report's contents as of now."""
         rows = read_table(self._table) if self._table.is_file() else []
-        presets = {name: Results(row for row in rows if row.preset == name) for name in presets_of(rows)}
+        presets = results_of(rows)
         claims = {name: judge(results) for name, results in presets.items()}
         charts = [heatmaps(presets), transfers(presets), failure_causes(presets)] if presets else []
         unfinished = list(self._unfinished())

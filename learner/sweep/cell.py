@@ -28,7 +28,7 @@ from learner.export.policy_file import read_saved_policy, save_policy
 from learner.file_names import EVALUATIONS
 from learner.run import RunResult, RunSession, last_checkpoint
 from learner.run_folder import RunFolder, RunIdentity
-from learner.sweep.grid import Cell, SweepConfig, cell_hash, done_cells, extrapolation_worlds
+from learner.sweep.grid import Cell, SweepConfig, cell_hash, done_cells, extrapolation_worlds, wanted_episodes
 from learner.tracking.journal import Row
 from learner.tracking.mlflow_run import Tracker
 from learner.tracking.redaction import public_uri
@@ -202,8 +202,9 @@ def _evaluate_all(
     """Makes the Extrapolation evaluations, and stores them and the Fixed one; returns all rows of results."""
     config = cell.config
     results = [_stored(sweep, cell, config, fixed, folder, weights.version)]
-    seeds = list(range(sweep.first_seed, sweep.first_seed + sweep.extrapolation_episodes))
+    wanted = wanted_episodes(sweep, cell)
     for world in extrapolation_worlds(sweep, cell):
+        seeds = list(range(sweep.first_seed, sweep.first_seed + wanted[world.robots, world.groups]))
         played = dataclasses.replace(config, world=world)
         results.append(_stored(sweep, cell, played, evaluate(played.env, weights, seeds), folder, weights.version))
     return results

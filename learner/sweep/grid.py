@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, cast, get_args
 
-from actors.evaluation.result_table import GROUPS, LEARNED, ROBOTS, ResultRow
+from actors.evaluation.result_table import GROUPS, LEARNED, ROBOTS, ResultRow, is_drawn
 from learner.config import WHERE, RunConfig, identity_dict, to_dict
 from learner.presets import PresetName, preset_config
 from sim_core.checks import ConfigError, check_fields, require
@@ -48,7 +48,7 @@ class SweepConfig:
     extrapolation: Literal["all", "none"] = "all"
     """Extrapolation: every policy in every other setup that it fits (M_IN, M_OUT: equal group count), or none."""
     extrapolation_episodes: int = 300
-    """Extrapolation: greedy episodes in each other setup."""
+    """Extrapolation: greedy episodes in each other setup; as many as Fixed where Figures 3.4 to 3.6 draw it."""
     baselines: tuple[BaselineName, ...] = ("fl-orca", "greedy")
     """Rules that do not learn (see `shoal evaluate`), evaluated in every setup like the policies; may be empty."""
     baseline_episodes: int = 500
@@ -282,8 +282,10 @@ def extrapolation_worlds(sweep: SweepConfig, cell: Cell) -> list[WorldConfig]:
 def wanted_episodes(sweep: SweepConfig, cell: Cell) -> dict[tuple[int, int], int]:
     """How many episodes a complete cell has in each setup, by (robots, groups)."""
     world, fixed = cell.config.world, cell.config.final_eval_episodes
-    others = dict.fromkeys(_extrapolation_setups(sweep, cell), sweep.extrapolation_episodes)
-    return {(world.robots, world.groups): fixed} | others
+    own, others = (world.robots, world.groups), _extrapolation_setups(sweep, cell)
+    is_sensor = world.method == DISSERTATION_METHODS[0]
+    drawn = [played for played in others if is_sensor and is_drawn(own, played)]
+    return {own: fixed} | dict.fromkeys(others, sweep.extrapolation_episodes) | dict.fromkeys(drawn, fixed)
 
 
 def done_cells(sweep: SweepConfig, cells: Iterable[Cell], rows: Iterable[ResultRow]) -> dict[str, list[ResultRow]]:

@@ -7,18 +7,18 @@ from dashboards.analysis.aggregate import SETUPS, Results, Setup
 from dashboards.analysis.claim_checks import Claim, at_least, rises
 from dashboards.analysis.claim_text import claims_markdown, details, evidence, tally, verdict_table
 from dashboards.analysis.claims import judge
-from tests.dashboards.tables import claimed_table, fixed
+from tests.dashboards.tables import claimed, fixed
 
 
 def judged(*changed: object, without: tuple[object, ...] = ()) -> list[Claim]:
-    return judge(Results(claimed_table(*changed, without=without)))  # type: ignore[arg-type]
+    return judge(claimed(*changed, without=without))  # type: ignore[arg-type]
 
 
 def test_the_table_has_one_row_per_claim_with_its_verdict():
     lines = verdict_table(judged(fixed("sensor", Setup(25, 1), success=75), without=(fixed("out", Setup(15, 8)),)))
     assert lines[0] == "| # | claim | verdict | evidence |"
     cells = [line.split(" | ") for line in lines[2:]]
-    assert [line[0] for line in cells] == [f"| {number}" for number in range(1, 16)]
+    assert [line[0] for line in cells] == [f"| {number}" for number in range(1, 27)]
     verdicts = {number: line[2] for number, line in enumerate(cells, start=1)}
     assert verdicts[1] == "**does not hold**" and verdicts[2] == "**holds**" and verdicts[14] == "no data"
 
@@ -55,14 +55,20 @@ def test_details_show_every_check_with_its_numbers():
 
 
 def test_the_tally_leaves_out_verdicts_without_claims():
-    assert tally(judged()) == "15 holds"
-    assert tally(judged(fixed("in", Setup(10, 1), success=60))) == "14 holds, 1 does not hold"
+    further = "; of 11 further statements 9 holds, 1 does not hold, 1 no data"
+    assert tally(judged()) == f"15 holds{further}"
+    assert tally(judged(fixed("in", Setup(10, 1), success=60))) == f"14 holds, 1 does not hold{further}"
+    assert tally(judged()[:15]) == "15 holds"
 
 
 def test_page_has_each_preset():
     page = claims_markdown({"best": judged(), "thesis": judge(Results([]))})
     assert page.index("## Preset best") < page.index("15 holds") < page.index("## Preset thesis")
-    assert page.count("### 15. ") == 2 and page.endswith("|\n")
+    assert page.count("### 15. ") == page.count("### 26. ") == 2 and page.endswith("|\n")
+    line = (
+        "| 7, 21 | 10r×8g is below 80 % (7) and above 80 % (21) | 7 holds; 21 does not hold | 7 no data; 21 no data |"
+    )
+    assert line in page[page.index("## Which contradict each other") :]
 
 
 def test_a_vertical_bar_in_a_name_breaks_no_table():

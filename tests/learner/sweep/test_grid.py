@@ -69,6 +69,17 @@ def test_a_policy_is_evaluated_in_every_setup_that_its_state_fits():
     assert extrapolation_worlds(SweepConfig(extrapolation="none"), make_cell(sweep, "sensor", 10, 2, 0)) == []
 
 
+def test_what_a_figure_draws_has_as_many_episodes_as_fixed():
+    """Figures 3.4 to 3.6: more robots or more groups than in the training, with M_sensor, from six trainings."""
+    sweep = SweepConfig(robots=(5, 10, 25), groups=(1, 2, 8), episodes=3_000, extrapolation_episodes=300)
+    drawn = {(25, 2), (10, 8)}
+    wanted = wanted_episodes(sweep, make_cell(sweep, "sensor", 10, 2, 0))
+    assert wanted == {(r, g): 3_000 if (r, g) in {(10, 2), *drawn} else 300 for r in (5, 10, 25) for g in (1, 2, 8)}
+    for other in (("sensor", 10, 8), ("sensor", 25, 2), ("out", 10, 2)):
+        wanted = wanted_episodes(sweep, make_cell(sweep, *other, 0))
+        assert sorted(wanted.values())[:-1] == [300] * (len(wanted) - 1)
+
+
 def test_a_cells_hash_depends_on_everything_that_decides_its_results():
     base = make_cell(SMALL, "sensor", 5, 2, 0)
     assert base.key.startswith("sensor-5r2g-s0-")
