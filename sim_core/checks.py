@@ -8,6 +8,8 @@ import math
 import typing
 from typing import Any, Literal
 
+import numpy as np
+
 
 class ConfigError(Exception):
     """An invalid setting. The message names the setting, its value and a fix."""
@@ -38,12 +40,17 @@ def require_packages(purpose: str, extra: str, *packages: str) -> None:
 def check_fields(config: Any) -> None:
     """Checks the bool, int, float, str and Literal fields of a config dataclass; it ignores fields of other types.
 
+    Numpy's scalars become plain ones of Python, which JSON and hashes of configs know.
+
     Raises:
       ConfigError: a value has the wrong type, is not finite, or is none of its field's choices.
     """
     hints = typing.get_type_hints(type(config))
     for field in dataclasses.fields(config):
         wanted, value = hints[field.name], getattr(config, field.name)
+        if isinstance(value, np.generic) and value.ndim == 0:
+            value = value.item()
+            object.__setattr__(config, field.name, value)
         if typing.get_origin(wanted) is Literal:
             choices = typing.get_args(wanted)
             known = isinstance(value, str) and value in choices

@@ -20,6 +20,10 @@ MAX_HEADINGS = 64
 MAX_HISTORY = 16
 MAX_ROBOTS = 100_000
 """Most robots of one world."""
+LARGEST = 1e6
+"""Largest length, speed, time or weight: kernels square them in float32."""
+LARGEST_REWARD = 1e38
+"""Largest reward, which is stored as float32."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -314,6 +318,9 @@ def _check_lengths(config: WorldConfig) -> None:
         require(getattr(config, name) > 0, f"{name} must be greater than 0, not {getattr(config, name)}")
     for name in NON_NEGATIVE:
         require(getattr(config, name) >= 0, f"{name} must not be negative, not {getattr(config, name)}")
+    for name in POSITIVE + NON_NEGATIVE:
+        value, largest = getattr(config, name), LARGEST_REWARD if name == "reward_scale" else LARGEST
+        require(value <= largest, f"{name} must be at most {largest:g}, not {value}")
     for name in ANGLES:
         require(0 < getattr(config, name) <= 180, f"{name} must be in (0, 180], not {getattr(config, name)}")
     require(
@@ -325,6 +332,16 @@ def _check_lengths(config: WorldConfig) -> None:
         config.orca_radius_m >= config.robot_radius_m,
         f"orca_radius_m ({config.orca_radius_m}) must be at least robot_radius_m ({config.robot_radius_m}), "
         "or ORCA steers into collisions",
+    )
+    require(
+        config.neighbour_range_m > 2 * config.orca_radius_m,
+        f"neighbour_range_m ({config.neighbour_range_m}) must be greater than 2 × orca_radius_m "
+        f"({2 * config.orca_radius_m:.3g} m), or robots see each other only once they are too near",
+    )
+    require(
+        config.orca_horizon_s >= config.time_step_s,
+        f"orca_horizon_s ({config.orca_horizon_s}) must be at least time_step_s ({config.time_step_s}), or robots "
+        "collide within the step that ORCA looks ahead",
     )
     step_m = config.time_step_s * config.top_speed_m_s
     require(

@@ -11,7 +11,9 @@ Observations, actions, rewards and outcomes are those of the chosen method. A su
 task terminates an episode; the horizon truncates it, unless a timeout is a failure (`horizon_is`). The vector
 environment restarts ended worlds in the same step (`AutoresetMode.SAME_STEP`): the returned observation is the new
 episode's first, the ended one's last stands in `infos["final_obs"]`, and `infos["final_info"]` holds `outcome`,
-`episode_length` and `episode_return`; the masks `_final_obs` and `_final_info` say where.
+`episode_length` and `episode_return`; the masks `_final_obs` and `_final_info` say where. `autoreset_mode` selects
+Gymnasium's other modes, which its wrappers of observations need: with `NEXT_STEP` a world restarts in the step after
+the one that ended it, with `DISABLED` only by `reset` with a mask. Then the same values stand in `infos` itself.
 """
 
 from __future__ import annotations
@@ -24,12 +26,13 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from sim_core.checks import ConfigError
+from sim_core.checks import ConfigError, require
 from sim_core.config import WorldConfig
 from sim_core.methods import make_method
 from sim_core.outcomes import Outcome
 from sim_core.render import draw_world
-from sim_core.worlds import WorldBatch, is_done, is_terminated
+from sim_core.reset_arguments import RESET_MASK, check_options, env_seeds, reset_mask, whole_seed
+from sim_core.worlds import StepResult, WorldBatch, is_done, is_terminated
 
 RENDER_MODES = ["rgb_array"]
 
@@ -93,7 +96,13 @@ class SwarmEnv(gym.Env[NDArray[Any], np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Starts an episode; with `seed`, from that seed's random stream."""
+        """Starts an episode; with `seed`, from that seed's random stream. There are no `options`.
+
+        Raises:
+          ValueError: the seed is negative or no whole number, or there is an option.
+        """
+        check_options(options, ())
+        seed = None if seed is None else whole_seed(seed)
         super().reset(seed=seed)
         if seed is None and not self._seeded:
             seed = int(self.np_random.integers(2**31))
@@ -126,11 +135,12 @@ class SwarmEnv(gym.Env[NDArray[Any], np.int64]):
 
 
 class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArray[Any]]):
-    """A batch of worlds stepped by one call; restarts in the same step (see the module).
+    """A batch of worlds stepped by one call.
 
     Args:
       num_envs: number of worlds.
       render_mode: None or `rgb_array`.
+      autoreset_mode: when ended worlds restart (see the module).
       **settings: fields of WorldConfig.
 
     Raises:
@@ -139,82 +149,110 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
 
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "autoreset_mode": AutoresetMode.SAME_STEP}
 
-    def __init__(self, num_envs: int = 1, render_mode: str | None = None, **settings: Any) -> None:
+    def __init__(
+        self,
+        num_envs: int = 1,
+        render_mode: str | None = None,
+        autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
+        **settings: Any,
+    ) -> None:
         _check_render_mode(render_mode)
+        modes = list(AutoresetMode)
+        require(autoreset_mode in modes, f"autoreset_mode must be one of {modes}, not {autoreset_mode!r}")
+        is_count = isinstance(num_envs, int | np.integer) and num_envs >= 1
+        require(is_count, f"num_envs must be a whole number of at least 1, not {num_envs!r}")
         self.config = make_config(settings)
         self.metadata = {
-            "autoreset_mode": AutoresetMode.SAME_STEP,
+            "autoreset_mode": autoreset_mode,
             "render_modes": RENDER_MODES,
             "render_fps": _frames_per_s(self.config),
         }
         self.render_mode = render_mode
-        self.num_envs = num_envs
+        self.num_envs = int(num_envs)
         self.single_observation_space = observation_space(self.config)
         self.single_action_space = gym.spaces.Discrete(self.config.num_actions)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.worlds = WorldBatch(self.config, num_envs)
-        self._seeded = False
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.worlds = WorldBatch(self.config, self.num_envs)
+        self._begun = False
+        self._mode = autoreset_mode
+        self._ended = np.zeros(self.num_envs, np.bool_)  # worlds that are to restart
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Starts an episode in every world; world i takes `seed + i`, or `seed[i]` of a list."""
-        if seed is None and not self._seeded:
-            seed = int(np.random.SeedSequence().generate_state(1)[0])
-        if isinstance(seed, int):
-            seed = [seed + i for i in range(self.num_envs)]
-        if seed is not None:
-            given = [value for value in seed if value is not None]
-            if len(given) != self.num_envs:
-                raise ValueError(f"seed must name {self.num_envs} whole numbers, one a world, not {seed!r}")
-            self.worlds.seed(given)
-            self._seeded = True
-        return self.worlds.reset(), {}
+        """Starts an episode in every world, or where `options["reset_mask"]` `[num_envs]` bool is True.
+
+        World i takes `seed + i`, or `seed[i]` of a list. Without a seed it goes on with its random stream; at its
+        first reset that is drawn at random.
+
+        Raises:
+          ValueError: see `env_seeds` and `reset_mask`; or the mask leaves out a world that has not begun.
+        """
+        mask, seeds = reset_mask(options, self.num_envs), env_seeds(seed, self.num_envs)
+        if not self._begun:
+            if mask is not None and not mask.all():
+                raise ValueError(f"the first reset must start every world; leave {RESET_MASK} out")
+            drawn = np.random.SeedSequence().generate_state(self.num_envs)
+            seeds = [int(drawn[world]) if own is None else own for world, own in enumerate(seeds)]
+            self._begun = True
+        if mask is not None:
+            seeds = [own if restarts else None for own, restarts in zip(seeds, mask, strict=True)]
+        self.worlds.seed(seeds)
+        self._ended[... if mask is None else mask] = False
+        return self.worlds.reset(mask), {}
 
     def step(
         self, actions: NDArray[np.int64]
     ) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """One env step of every world; `actions` `[num_envs]`.
+        """One env step of every world; `actions` `[num_envs]`. A world that restarts in it takes no action.
 
         Raises:
-          ValueError: an action is none of the action space.
+          ValueError: an action is none of the action space, or a world has ended and is not to restart by itself.
         """
         actions = np.asarray(actions)
         whole = actions.shape == (self.num_envs,) and np.issubdtype(actions.dtype, np.integer)
         if not whole or actions.min() < 0 or actions.max() >= self.config.num_actions:
             raise ValueError(f"actions must be {self.num_envs} whole numbers in 0..{self.config.num_actions - 1}")
+        if self._mode is AutoresetMode.DISABLED and self._ended.any():
+            raise ValueError(f"worlds {np.flatnonzero(self._ended).tolist()} have ended; reset them with {RESET_MASK}")
+        restarted, streams = self._ended, self.worlds.state.rng.copy()
         result = self.worlds.step(actions.astype(np.int64, copy=False))
-        done = is_done(result.outcome)
-        terminated = is_terminated(result.outcome, self.config.timeout_fails)
-        observation, infos = result.observation, dict[str, Any]()
-        if done.any():
-            infos = {
-                "final_obs": observation,
-                "_final_obs": done,
-                "final_info": {
-                    "outcome": result.outcome,
-                    "_outcome": done,
-                    "episode_length": result.steps,
-                    "_episode_length": done,
-                    "episode_return": result.episode_return,
-                    "_episode_return": done,
-                },
-                "_final_info": done,
-            }
-            observation = self.worlds.reset(done)
-        return observation, result.reward.astype(np.float64), terminated, done & ~terminated, infos
+        done = is_done(result.outcome) & ~restarted
+        terminated = is_terminated(result.outcome, self.config.timeout_fails) & done
+        observation, reward = result.observation, result.reward.astype(np.float64)
+        infos = _ends(result, done) if done.any() else {}
+        if self._mode is AutoresetMode.SAME_STEP:
+            if done.any():
+                infos = {"final_obs": observation, "_final_obs": done, "final_info": infos, "_final_info": done}
+                observation = self.worlds.reset(done)
+            return observation, reward, terminated, done & ~terminated, infos
+        if restarted.any():  # they start as if they had not been stepped
+            self.worlds.state.rng[restarted] = streams[restarted]
+            observation, reward[restarted] = self.worlds.reset(restarted), 0.0
+        self._ended = done
+        return observation, reward, terminated, done & ~terminated, infos
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Copies of all arrays that a checkpoint needs, by name."""
-        return self.worlds.get_state()
+        waiting = {} if self._mode is AutoresetMode.SAME_STEP else {"ended": self._ended.copy()}
+        return self.worlds.get_state() | waiting
 
     def set_state(self, saved: dict[str, NDArray[Any]]) -> NDArray[Any]:
         """Takes up saved arrays; returns the observations there (see `WorldBatch.set_state` for errors)."""
-        return self.worlds.set_state(saved)
+        observation = self.worlds.set_state(saved)
+        self._begun = True
+        self._ended = saved.get("ended", np.zeros(self.num_envs, np.bool_)).copy()
+        return observation
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One image `[height, width, 3]` uint8 a world in mode `rgb_array`, else None."""
         if self.render_mode != "rgb_array":
             return None
         return tuple(_draw(self.worlds, world) for world in range(self.num_envs))
+
+
+def _ends(result: StepResult, done: NDArray[np.bool_]) -> dict[str, Any]:
+    """What is told of the episodes that ended in a step, with the masks that say where."""
+    values = {"outcome": result.outcome, "episode_length": result.steps, "episode_return": result.episode_return}
+    return values | {f"_{name}": done for name in values}

@@ -15,12 +15,16 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import hashlib
+import io
 import os
 import shutil
+import stat
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +33,7 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataC
 
 KERNEL_PACKAGES = ("actors", "learner")
 """The other packages with kernels. They lie beside this one."""
+ANOTHER = "NUMBA_CACHE_DIR names another folder"
 UNUSED_S = 30 * 86_400.0
 """Kernels of other sources that no process has loaded for so long are removed."""
 
@@ -76,26 +81,39 @@ def cache_folder() -> str:
     """Folder of the kernels that were compiled from the present sources, which it makes.
 
     It lies in numba's own NUMBA_CACHE_DIR where that is set, else in the user's cache folder, else beside the sources,
-    else in the folder for temporary files: the first that can be written.
+    else in a folder for temporary files, which is said: the first that can be written. If there is none, the folder
+    that is returned cannot be written: kernels are used without it, which is said as well.
     """
     name, bases = f"kernels-{sources_digest()}", _bases()
     for base in bases:
         if _is_usable(base / name):
             return str(base / name)
-    temporary = Path(tempfile.gettempdir()) / f"shoal-{os.getuid()}"
-    is_new = not temporary.exists()
-    with contextlib.suppress(FileExistsError):
-        temporary.mkdir(mode=0o700)
-    if temporary.stat().st_uid != os.getuid() or not _is_usable(temporary / name):
-        return tempfile.mkdtemp(prefix="shoal-kernels-")
+    temporary = _temporary_folder()
+    is_new = temporary is not None and not (temporary / name).exists()
+    if temporary is None or not _is_usable(temporary / name):
+        return str(bases[0] / name)
     if is_new:
         tried = " nor ".join(str(base) for base in bases)
-        print(
-            f"compiled kernels are kept in {temporary}, since neither {tried} can be written; NUMBA_CACHE_DIR names "
-            "another folder",
-            file=sys.stderr,
-        )
+        _say(f"compiled kernels are kept in {temporary}, since neither {tried} can be written; {ANOTHER}")
     return str(temporary / name)
+
+
+def _temporary_folder() -> Path | None:
+    """This user's own folder for temporary files; None if there is none, or others could write code to it."""
+    try:
+        folder = Path(tempfile.gettempdir()) / f"shoal-{os.getuid()}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+    except OSError:
+        return None
+    is_own = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022
+    return folder if is_own else None
+
+
+@functools.cache
+def _say(text: str) -> None:
+    """Says a sentence, once in this process."""
+    print(text, file=sys.stderr)
 
 
 CACHE_FOLDER = cache_folder()
@@ -133,23 +151,57 @@ class _CacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
         return f"{super().get_filename_base(fullname, abiflags)}-{self._lineno}"
 
 
-class LockedCacheFile(IndexDataCacheFile):  # type: ignore[misc]
-    """The cached signatures of one kernel, which several processes may save at once.
+class CheckedCacheFile(IndexDataCacheFile):  # type: ignore[misc]
+    """The cached signatures of one kernel, which several processes may save at once, in files that end in a checksum.
 
     Numba's own class locks nothing: two processes that save different signatures can choose the same file name, and a
-    third one then loads the code of the wrong signature.
+    third one then loads the code of the wrong signature. Nor does it check anything: it runs what a file holds in
+    which a bit has changed.
     """
 
     def save(self, key: Any, data: Any) -> None:
-        """Saves the code of one signature, unless the disk takes nothing."""
-        with contextlib.suppress(OSError), open(f"{self._index_path}.lock", "w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            super().save(key, data)
+        """Saves the code of one signature, unless the disk takes nothing, which is said."""
+        try:
+            with open(f"{self._index_path}.lock", "w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                super().save(key, data)
+        except OSError as error:
+            reason = error.strerror or error
+            _say(
+                f"compiled kernels cannot be kept in {CACHE_FOLDER} ({reason}), so every start compiles them; {ANOTHER}"
+            )
 
     def forget(self) -> None:
         """Removes the index, so that all signatures are compiled anew."""
         with contextlib.suppress(OSError):
             os.remove(self._index_path)
+
+    @contextlib.contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[io.BytesIO]:
+        content = io.BytesIO()
+        yield content
+        with super()._open_for_write(filepath) as file:
+            file.write(content.getvalue() + hashlib.sha256(content.getvalue()).digest())
+
+    def _load_index(self) -> Any:
+        """Numba's index; one that is missing or damaged counts as empty."""
+        return super()._load_index() if _is_whole(self._index_path) else {}
+
+    def _load_data(self, name: str) -> Any:
+        """The code of one signature; for numba, a damaged file is one that cannot be opened."""
+        if not _is_whole(self._data_path(name)):
+            raise OSError(f"{name} is damaged")
+        return super()._load_data(name)
+
+
+def _is_whole(path: str) -> bool:
+    """Whether a file is there and ends in the checksum of what stands before it."""
+    try:
+        content = Path(path).read_bytes()
+    except OSError:
+        return False
+    size = hashlib.sha256().digest_size
+    return hashlib.sha256(content[:-size]).digest() == content[-size:]
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
@@ -163,12 +215,12 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
 
     def __init__(self, function: Any) -> None:
         super().__init__(function)
-        self._cache_file = LockedCacheFile(CACHE_FOLDER, self._impl.filename_base, 0)
+        self._cache_file = CheckedCacheFile(CACHE_FOLDER, self._impl.filename_base, 0)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled code of a signature; None where it is not there, or damaged, which numba would raise."""
+        """The compiled code of a signature; None where it is not there, or of another time, which numba would raise."""
         try:
             return super().load_overload(sig, target_context)
-        except Exception:  # a damaged pickle raises almost anything
+        except Exception:  # a pickle whose classes have changed raises almost anything
             self._cache_file.forget()
             return None

@@ -15,7 +15,6 @@ import json
 import os
 import re
 import sys
-import tempfile
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
@@ -176,16 +175,36 @@ def _module(kind: Kind, file_name: str, source: str) -> ModuleType:
 
 
 def _materialised(file_name: str, source: str, digest: str) -> Path:
-    """A file with the text of a user's own, in a folder that is named by its content."""
+    """A file with the text of a user's own, in a folder that is named by its content.
+
+    Raises:
+      ConfigError: it cannot be written.
+    """
     from sim_core.kernel_cache import CACHE_FOLDER
 
     path = Path(CACHE_FOLDER) / "plugins" / digest / file_name
-    if not path.is_file():  # a file that is written anew would void the kernels that numba keeps of it
+    if _text_of(path) == source:  # a file that is written anew would void the kernels that numba keeps of it
+        return path
+    draft = path.with_name(f"{file_name}.{os.getpid()}.part")
+    try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=path.parent, encoding="utf-8", delete=False) as draft:
-            draft.write(source)
-        os.replace(draft.name, path)
+        draft.write_text(source, "utf-8", newline="")
+        os.replace(draft, path)
+    except OSError as error:
+        raise ConfigError(
+            f"{file_name} needs a copy in {CACHE_FOLDER}, which cannot be written ({error}); make room there, or name "
+            "another folder with NUMBA_CACHE_DIR"
+        ) from error
     return path
+
+
+def _text_of(path: Path) -> str | None:
+    """The text of a file; None if it is missing or damaged."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return file.read()
+    except (OSError, UnicodeDecodeError):
+        return None
 
 
 def blame(error: BaseException, path: Path) -> str:

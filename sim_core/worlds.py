@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -90,15 +90,17 @@ class WorldBatch:
         self._all = np.ones(num_worlds, np.bool_)
         self.seed(list(range(num_worlds)))
 
-    def seed(self, seeds: list[int]) -> None:
-        """Gives world i the random stream of `seeds[i]`; until then it is that of seed i.
+    def seed(self, seeds: Sequence[int | None]) -> None:
+        """Gives world i the random stream of `seeds[i]`; None leaves it as it is. At first it is that of seed i.
 
         Raises:
           ValueError: there is not one seed a world.
         """
         if len(seeds) != self.num_worlds:
             raise ValueError(f"seeds must be {self.num_worlds}, one a world, not {len(seeds)}")
-        self.state.rng[:] = [world_streams(seed, 1)[0] for seed in seeds]
+        for world, seed in enumerate(seeds):
+            if seed is not None:
+                self.state.rng[world] = world_streams(seed, 1)[0]
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> NDArray[Any]:
         """Starts new episodes where `mask` `[num_worlds]` is set (everywhere by default).

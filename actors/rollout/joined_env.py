@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -11,6 +11,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from sim_core.envs import SwarmVectorEnv
+from sim_core.reset_arguments import RESET_MASK, env_seeds, reset_mask
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -36,11 +37,16 @@ class JoinedVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDAr
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Starts an episode in every world; world i takes `seed[i]`."""
-        seeds = [None] * len(self._parts) if not isinstance(seed, list) else np.split(np.array(seed), self._ends)
-        given = [None if part is None else cast("list[int | None]", part.tolist()) for part in seeds]
-        parts = zip(self._parts, given, strict=True)
-        return np.concatenate([part.reset(seed=own)[0] for part, own in parts]), {}
+        """Starts episodes as `SwarmVectorEnv.reset` does (see there for errors)."""
+        seeds, mask = env_seeds(seed, self.num_envs), reset_mask(options, self.num_envs)
+        masks = np.split(np.ones(self.num_envs, np.bool_) if mask is None else mask, self._ends)
+        seen, begin = [], 0
+        for part, own in zip(self._parts, masks, strict=True):
+            given = seeds[begin : begin + part.num_envs]
+            starts = part.reset(seed=given, options={RESET_MASK: own})[0] if own.any() else part.worlds.observation()
+            seen.append(starts)
+            begin += part.num_envs
+        return np.concatenate(seen), {}
 
     def step(
         self, actions: NDArray[np.int64]

@@ -238,6 +238,11 @@ class EllipseMethod(Method):
             f"robots must be at least 3 per group for method {config.method_name!r}, not {min(config.group_sizes)}: an "
             "ellipse without the learning robot (ellipse_counts_learner) needs two others",
         )
+        require(
+            config.apf_range_m > 2 * config.robot_radius_m,
+            f"apf_range_m ({config.apf_range_m}) must be greater than 2 × robot_radius_m "
+            f"({2 * config.robot_radius_m:.3g} m), within which robots have collided",
+        )
 
     @classmethod
     def rules(cls, config: WorldConfig) -> dict[str, Rule]:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_core.checks import require
 from sim_core.config import WorldConfig
 from sim_core.jit import kernel
 from sim_core.methods.base import Method, Preset, Rule
@@ -162,7 +163,12 @@ class SensorMethod(Method):
 
     @classmethod
     def check(cls, config: WorldConfig) -> None:
-        """Every setting works: sectors may be in the world's frame or the goal's."""
+        """Raises ConfigError where the inner disc holds none but colliding robots; every frame of sectors works."""
+        require(
+            config.inner_radius_m > 2 * config.robot_radius_m,
+            f"inner_radius_m (R1 = {config.inner_radius_m}) must be greater than 2 × robot_radius_m "
+            f"({2 * config.robot_radius_m:.3g} m), within which robots have collided",
+        )
 
     @classmethod
     def rules(cls, config: WorldConfig) -> dict[str, Rule]:

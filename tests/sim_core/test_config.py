@@ -7,7 +7,7 @@ import math
 import pytest
 
 from sim_core.checks import ConfigError
-from sim_core.config import ANGLES, MAX_HEADINGS, NON_NEGATIVE, POSITIVE, WorldConfig
+from sim_core.config import ANGLES, LARGEST, LARGEST_REWARD, MAX_HEADINGS, NON_NEGATIVE, POSITIVE, WorldConfig
 from sim_core.scenes.circle import start_grid_radius_m
 
 DEFAULTS = {field.name: field.default for field in dataclasses.fields(WorldConfig)}
@@ -187,3 +187,33 @@ def test_the_configuration_is_frozen_and_refuses_unknown_keys():
 def test_stop_action_adds_one():
     assert WorldConfig(sectors=6).num_actions == 6
     assert WorldConfig(sectors=6, stop_action=True).num_actions == 7
+
+
+@pytest.mark.parametrize("name", POSITIVE + NON_NEGATIVE)
+def test_a_number_that_float32_cannot_square_is_refused(name):
+    largest = LARGEST_REWARD if name == "reward_scale" else LARGEST
+    refuses(name, **{name: 10 * largest})
+
+
+@pytest.mark.parametrize("method", ["sensor", "in", "out"])
+@pytest.mark.parametrize(
+    ("field", "settings"),
+    [
+        ("orca_horizon_s", {"orca_horizon_s": 0.01}),
+        ("orca_horizon_s", {"orca_horizon_s": 0.15, "time_step_s": 0.16}),
+        ("neighbour_range_m", {"neighbour_range_m": 0.4}),
+        ("neighbour_range_m", {"orca_radius_m": 0.8}),
+    ],
+)
+def test_ranges_and_horizons_that_see_nothing_in_time_are_refused(method, field, settings):
+    refuses(field, method=method, **settings)
+
+
+@pytest.mark.parametrize(
+    ("method", "field"), [("sensor", "inner_radius_m"), ("in", "apf_range_m"), ("out", "apf_range_m")]
+)
+def test_a_range_of_colliding_robots_alone_is_refused(method, field):
+    refuses(field, method=method, **{field: 0.2})
+    assert getattr(WorldConfig(method=method, **{field: 0.21}), field) == 0.21
+    other = {"sensor": "in"}.get(method, "sensor")
+    assert getattr(WorldConfig(method=other, **{field: 0.2}), field) == 0.2

@@ -3,6 +3,7 @@
 import inspect
 import os
 import re
+import resource
 import shutil
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import pytest
 import sim_core
 from sim_core import jit, kernel_cache
 from sim_core.jit import inlined, kernel
-from sim_core.kernel_cache import LockedCacheFile
+from sim_core.kernel_cache import CheckedCacheFile
 
 ROOT = Path(sim_core.__file__).parents[1]
 
@@ -35,11 +36,11 @@ print(state.pos_x.sum() + state.pos_y.sum(), numba.config.CACHE_DIR == before)
 """
 
 
-def start_a_world(folder, caches=None, before=""):
+def start_a_world(folder, caches=None):
     """Runs the sources in `folder` in a new process: (sum of the start positions, whether CACHE_DIR is unchanged)."""
     env = os.environ | {"PYTHONPATH": str(folder), "NUMBA_CACHE_DIR": str((caches or folder) / "cache")}
     done = subprocess.run(
-        [sys.executable, "-c", before + START_A_WORLD], cwd=folder, env=env, capture_output=True, text=True, check=False
+        [sys.executable, "-c", START_A_WORLD], cwd=folder, env=env, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     total, unchanged = done.stdout.split()
@@ -137,26 +138,63 @@ def test_copies_of_the_sources_share_their_kernels(tmp_path):
     assert start_a_world(other, tmp_path) == first and cached(tmp_path) == compiled
 
 
-def test_damaged_files_are_compiled_anew(tmp_path):
-    copy_packages(tmp_path, "sim_core")
-    first = start_a_world(tmp_path)
-    files = list(cached(tmp_path))
-    for damage in (lambda content: content[: len(content) // 2], lambda _: b"", lambda _: b"nothing"):
-        for pattern in ("*.nbi", "*.nbc"):
-            for path in (tmp_path / "cache").rglob(pattern):
-                path.write_bytes(damage(path.read_bytes()))
-            assert start_a_world(tmp_path) == first
-            whole = cached(tmp_path)
-            assert set(whole) == set(files)
-            assert start_a_world(tmp_path) == first and cached(tmp_path) == whole
+def _doubles(x):
+    return x + x
 
 
-def test_kernels_that_cannot_be_saved_are_used_without(tmp_path):
-    copy_packages(tmp_path, "sim_core")
-    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))\n"  # as on a full disk
-    first = start_a_world(tmp_path, before=limit)
-    assert not [path for path in cached(tmp_path) if path.stat().st_size]
-    assert start_a_world(tmp_path) == first and cached(tmp_path)
+@pytest.fixture
+def cache(monkeypatch, tmp_path):
+    """A cache folder of the test's own."""
+    monkeypatch.setattr(kernel_cache, "CACHE_FOLDER", str(tmp_path))
+    kernel_cache._say.cache_clear()
+    return tmp_path
+
+
+DAMAGES = {
+    "cut to half": lambda content: content[: len(content) // 2],
+    "cut by one byte": lambda content: content[:-1],
+    "empty": lambda content: b"",
+    "zeros": lambda content: bytes(len(content)),
+    "text": lambda content: b"no cache",
+    "one bit": lambda content: content[:-40] + bytes([content[-40] ^ 1]) + content[-39:],
+    "made by numba alone": lambda content: content[:-32],
+}
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_cache_heals_itself(cache, suffix, damage):
+    assert kernel(_doubles)(2.0) == 4.0
+    (path,) = cache.rglob(f"*.{suffix}")
+    whole = path.read_bytes()
+    path.write_bytes(DAMAGES[damage](whole))
+    made = kernel(_doubles)
+    assert made(2.0) == 4.0 and not made.stats.cache_hits
+    again = kernel(_doubles)
+    assert again(2.0) == 4.0 and sum(again.stats.cache_hits.values()) == 1
+    assert len(list(cache.rglob("*.nb?"))) == 2
+
+
+def test_a_cached_file_that_cannot_be_unpickled_or_linked_is_compiled_anew(cache, monkeypatch):
+    assert kernel(_doubles)(2.0) == 4.0
+    for error in (AttributeError("a class of another version"), RuntimeError("no such symbol"), PermissionError()):
+        with monkeypatch.context() as patch:
+            patch.setattr(CheckedCacheFile, "_load_data", lambda self, name, error=error: (_ for _ in ()).throw(error))
+            made = kernel(_doubles)
+            assert made(2.0) == 4.0 and not made.stats.cache_hits
+
+
+def test_kernels_that_cannot_be_saved_are_used_without_which_is_said_once(cache, capsys):
+    """The system refuses every byte that this process writes to a file, as a full disk does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        results = [kernel(_doubles)(2.0), kernel(_doubles)(2.0), kernel(_doubles)(2)]
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert results == [4.0, 4.0, 4]
+    assert capsys.readouterr().err.count("cannot be kept") == 1
+    assert kernel(_doubles)(2.0) == 4.0 and list(cache.rglob("*.nbc"))
 
 
 def test_other_users_of_numba_keep_their_cache_folder(monkeypatch):
@@ -195,6 +233,31 @@ def test_the_first_folder_that_can_be_written_keeps_the_kernels(monkeypatch, tmp
     assert users.stat().st_mode & 0o777 == 0o700, "nobody else puts code there"
 
 
+def test_a_folder_that_others_can_write_code_to_is_not_used(monkeypatch, tmp_path):
+    monkeypatch.setattr(kernel_cache.tempfile, "tempdir", str(tmp_path))
+    folder = tmp_path / f"shoal-{os.getuid()}"
+    assert kernel_cache._temporary_folder() == folder
+    folder.chmod(0o777)
+    assert kernel_cache._temporary_folder() is None
+    folder.rmdir()
+    (tmp_path / "elsewhere").mkdir(mode=0o700)
+    folder.symlink_to(tmp_path / "elsewhere")
+    assert kernel_cache._temporary_folder() is None
+
+
+def test_where_nothing_can_be_written_kernels_are_compiled_all_the_same(cache, monkeypatch, capsys):
+    def nowhere():
+        raise FileNotFoundError("no usable temporary directory")
+
+    monkeypatch.setattr(kernel_cache, "_is_usable", lambda folder: False)
+    monkeypatch.setattr(kernel_cache.tempfile, "gettempdir", nowhere)
+    folder = kernel_cache.cache_folder()
+    (cache / "in the way").write_text("no folder can be made in a file")
+    monkeypatch.setattr(kernel_cache, "CACHE_FOLDER", str(cache / "in the way" / Path(folder).name))
+    assert kernel(_doubles)(2.0) == 4.0
+    assert capsys.readouterr().err.count("cannot be kept") == 1
+
+
 def test_a_user_without_a_home_needs_no_cache_folder(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr(kernel_cache.os.path, "expanduser", lambda path: path)  # as for a user who has none
@@ -215,14 +278,14 @@ def test_kernels_that_nobody_used_for_long_are_removed(monkeypatch, tmp_path):
 
 def test_signatures_that_are_saved_at_once_keep_their_own_code(tmp_path):
     def save(i):
-        LockedCacheFile(str(tmp_path), "kernel", "stamp").save(f"signature {i}", f"code {i}")
+        CheckedCacheFile(str(tmp_path), "kernel", "stamp").save(f"signature {i}", f"code {i}")
 
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(save, range(100)))
-    cache = LockedCacheFile(str(tmp_path), "kernel", "stamp")
+    cache = CheckedCacheFile(str(tmp_path), "kernel", "stamp")
     assert [cache.load(f"signature {i}") for i in range(100)] == [f"code {i}" for i in range(100)]
 
 
 def test_kernels_are_saved_under_the_lock():
     for made in (kernel(lambda x: x + 1), inlined(lambda x: x + 1)):
-        assert type(made._cache._cache_file) is LockedCacheFile
+        assert type(made._cache._cache_file) is CheckedCacheFile

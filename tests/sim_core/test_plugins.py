@@ -1,6 +1,7 @@
 """A user's own methods and scenes: the examples as oracles of each other, what travels, and what is refused how."""
 
 import json
+import os
 import pickle
 import textwrap
 from pathlib import Path
@@ -11,8 +12,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import deploy
-from sim_core import ENV_ID, ConfigError, WorldConfig
-from sim_core.plugins import SOURCES, PluginError
+from sim_core import ENV_ID, ConfigError, WorldConfig, kernel_cache
+from sim_core.plugins import SOURCES, PluginError, _materialised
 from sim_core.render import draw_world
 from sim_core.worlds import Pilot, WorldBatch, rehearse
 
@@ -101,6 +102,30 @@ def test_a_file_that_lies_on_no_disk_is_taken_from_the_environment(tmp_path, mon
     (tmp_path / "mine.py").unlink()
     monkeypatch.setenv(SOURCES, json.dumps({str(tmp_path / "mine.py"): text}))
     assert WorldConfig(method=name).sources == ((str(tmp_path / "mine.py"), text),)
+
+
+@pytest.mark.parametrize("damage", [lambda text: text[: len(text) // 2], lambda text: "", lambda text: "\udcff"])
+def test_a_damaged_copy_of_a_file_is_written_anew(tmp_path, monkeypatch, damage):
+    monkeypatch.setattr(kernel_cache, "CACHE_FOLDER", str(tmp_path))
+    copy = _materialised("mine.py", METHOD, "0123")
+    before = copy.stat().st_mtime_ns
+    assert _materialised("mine.py", METHOD, "0123") == copy and copy.stat().st_mtime_ns == before
+    copy.write_text(damage(METHOD), errors="surrogateescape")
+    assert _materialised("mine.py", METHOD, "0123").read_text() == METHOD
+    assert len(list(copy.parent.iterdir())) == 1 and copy.stat().st_mode & 0o077 == 0o077 & ~umask() & 0o066
+
+
+def umask():
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def test_a_copy_that_cannot_be_written_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("no folder can be made in a file")
+    monkeypatch.setattr(kernel_cache, "CACHE_FOLDER", str(tmp_path / "file" / "kernels"))
+    with pytest.raises(ConfigError, match="mine.py needs a copy in .*NUMBA_CACHE_DIR"):
+        _materialised("mine.py", METHOD, "0123")
 
 
 def test_gymnasium_takes_them_and_finds_nothing_wrong():
