@@ -48,24 +48,35 @@ COMMANDS: dict[type[Command], str] = {
     Dashboard: "dashboard",
 }
 """Every command's name, by its options, in the order of the help text."""
+CONFIGS = Path(__file__).parent / "configs"
+"""Configs that are part of shoal."""
 JOBS = ("train", "sweep")
 """Commands that `shoal submit` can run."""
 BAD_PATH_ERRORS = (errno.ENAMETOOLONG, errno.EILSEQ, errno.ELOOP)
 """Errors of paths that no file can have. A command may meet them wherever it first opens the path."""
 
 
-def read_config_file(path: Path) -> RunConfig:
-    """Reads a config from a TOML file.
+def config_file(named: Path) -> Path:
+    """The file that `--config` names: a path, or the name of a config that is part of shoal, such as `cartpole`."""
+    own = CONFIGS / f"{named.name}.toml"
+    return own if named.parts == (named.name,) and own.is_file() and not named.is_file() else named
+
+
+def read_config_file(named: Path) -> RunConfig:
+    """Reads a config from the TOML file that `--config` names.
 
     Raises:
       ConfigError: the file cannot be read, is not valid TOML, or holds an unknown key or an impossible value.
     """
     try:
-        values = tomllib.loads(path.read_text("utf-8"))
+        values = tomllib.loads(config_file(named).read_text("utf-8-sig"))  # Windows' editors write a mark first
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--config {path} cannot be read: {error}") from error
+        known = ", ".join(sorted(path.stem for path in CONFIGS.glob("*.toml")))
+        raise ConfigError(f"--config {named} cannot be read: {error}; configs of shoal: {known}") from error
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"--config {path} is no valid TOML: {error}") from error
+        raise ConfigError(f"--config {named} is no valid TOML: {error}") from error
+    except RecursionError as error:
+        raise ConfigError(f"--config {named} is nested too deeply; settings are plain values and lists") from error
     return from_dict(values)
 
 

@@ -153,8 +153,8 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        values = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        values = json.loads(path.read_text("utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path} cannot be read ({error}); name another run or start a new one") from error
     if not isinstance(values, dict):
         raise ConfigError(f"{path} is not a JSON object; name another run or start a new one")

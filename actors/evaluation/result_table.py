@@ -86,7 +86,7 @@ def read_table(path: Path) -> list[ResultRow]:
       ConfigError: the file cannot be read, has other columns, or has a row with impossible counts.
     """
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # as spreadsheets write it
             lines = list(csv.reader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"the results {path} cannot be read ({error}); name a results.csv of a sweep") from error

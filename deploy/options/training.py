@@ -77,7 +77,7 @@ class Train:
     """Train one setup from the start."""
 
     config: Path | None = None
-    """TOML file with settings; flags override it. World settings are under [world]."""
+    """TOML file with settings, or a config of shoal (cartpole); flags override it. World settings are under [world]."""
     preset: TrainingPreset | None = None
     """Named settings of --method in place of the defaults: those of `shoal sweep`, or of one policy for all setups."""
     or_resume: bool = False

@@ -39,11 +39,11 @@ def read_provenance(table: Path) -> list[Provenance]:
     A file of the first format holds the last command alone, as the grid under `sweep` and its `commit`.
     """
     try:
-        stored = json.loads((table.parent / SETTINGS).read_text())
+        stored = json.loads((table.parent / SETTINGS).read_text("utf-8-sig"))
         if KEY not in stored:
             return [Provenance(sweep_command(grid_of(stored["sweep"])), str(stored["commit"]))]
         return [Provenance(str(each["command"]), str(each["commit"])) for each in stored[KEY]]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []
 
 

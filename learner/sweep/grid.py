@@ -118,6 +118,8 @@ def parse_overrides(assignments: tuple[str, ...]) -> tuple[dict[str, Any], dict[
             parsed = tomllib.loads(f"value = {value}")["value"]
         except tomllib.TOMLDecodeError:
             parsed = value  # a bare word
+        except RecursionError as error:
+            raise ConfigError(f"set {name} is nested too deeply; settings are plain values and lists") from error
         settings = run if name in RunConfig.__dataclass_fields__ else world
         settings[name] = tuple(parsed) if isinstance(parsed, list) else parsed
     return run, world

@@ -68,6 +68,6 @@ def read_faults(path: Path) -> list[FaultEntry]:
     for line in lines:
         try:
             entries.append(FaultEntry(*json.loads(line)))
-        except ValueError:
+        except (ValueError, TypeError, RecursionError):
             continue  # a killed driver's half-written line, with the next driver's first line appended
     return entries

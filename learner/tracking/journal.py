@@ -120,7 +120,7 @@ def read_rows(path: Path) -> list[Row]:
         return [Row(*json.loads(line)) for line in lines]
     except FileNotFoundError:
         return []
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"the metrics {path} cannot be read ({error}); restore the whole file") from error
 
 

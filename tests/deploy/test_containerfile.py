@@ -104,6 +104,9 @@ def test_the_copied_files_build_a_wheel_with_every_package(copied, tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     kept = [name for name in context() if not name.startswith("deploy/examples/")]  # examples are not packaged
-    sources = {name for name in kept if name.endswith(".py") or name.startswith("dashboards/web/")}
+    data = ("dashboards/web/", "deploy/configs/")
+    sources = {name for name in kept if name.endswith((".py", "/py.typed")) or name.startswith(data)}
     assert sources <= names
     assert {"learner/ray_backend/cluster.py", "sim_core/methods/m_sensor.py", "dashboards/web/player.js"} <= sources
+    packages = ("sim_core", "actors", "learner", "deploy", "dashboards")
+    assert {"deploy/configs/cartpole.toml", *(f"{name}/py.typed" for name in packages)} <= names

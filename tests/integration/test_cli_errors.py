@@ -87,6 +87,8 @@ def test_cuda_is_refused_where_there_is_none(capsys, tmp_path, monkeypatch, engi
         ("world = 3", ["world", "section"]),
         ("learning_rate = 'fast'", ["learning_rate", "number"]),
         ("hidden_sizes = 64", ["hidden_sizes"]),
+        ("hidden_sizes = " + "[" * 100_000, ["run.toml", "nested too deeply"]),
+        ("world = " + "{a=" * 100_000, ["run.toml", "nested too deeply"]),
     ],
 )
 def test_train_refuses_a_config_file(capsys, tmp_path, monkeypatch, text, words):
@@ -112,6 +114,25 @@ def test_a_config_file_gives_the_defaults_and_flags_override_them(tmp_path):
     command = parse(["train", "--config", str(tmp_path / "run.toml"), "--robots", "7"])
     assert (command.run.batch_size, command.run.hidden_sizes) == (64, (32, 16))
     assert (command.run.world.robots, command.run.world.groups) == (7, 3)
+
+
+def test_a_config_file_of_windows_begins_with_a_mark(tmp_path):
+    (tmp_path / "run.toml").write_text("batch_size = 64\r\n", "utf-8-sig")
+    assert parse(["train", "--config", str(tmp_path / "run.toml")]).run.batch_size == 64
+
+
+def test_a_config_of_shoal_is_known_by_its_name_anywhere(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    named = parse(["train", "--config", "cartpole", "--seed", "3"]).run
+    assert (named.env_id, named.hidden_sizes, named.seed) == ("CartPole-v1", (64, 64), 3)
+    (tmp_path / "cartpole").mkdir()
+    assert parse(["train", "--config", "cartpole", "--seed", "3"]).run == named
+    code, error = run(capsys, "train", "--config", "cartpoll")
+    assert code == 2 and "cartpoll cannot be read" in error and "configs of shoal: cartpole" in error
+    (tmp_path / "own.toml").write_text("batch_size = 64\n")
+    (tmp_path / "own.toml").rename(tmp_path / "cartpole" / "cartpole")
+    monkeypatch.chdir(tmp_path / "cartpole")
+    assert parse(["train", "--config", "cartpole"]).run.batch_size == 64  # a file of the user's goes first
 
 
 def test_an_unreachable_tracking_server_is_refused_at_the_start(capsys, tmp_path, monkeypatch):

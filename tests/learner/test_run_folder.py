@@ -18,6 +18,14 @@ def test_config_round_trip(tmp_path, small_run):
     assert sorted(path.name for path in folder.path.iterdir()) == ["config.json"]
 
 
+def test_a_config_that_an_editor_of_windows_saved_is_read(tmp_path, small_run):
+    folder = RunFolder(tmp_path)
+    folder.save_config(small_run)
+    path = tmp_path / "config.json"
+    path.write_text(path.read_text(), "utf-8-sig")
+    assert folder.config() == small_run
+
+
 def test_identity_round_trip(tmp_path):
     folder = RunFolder(tmp_path / "one")
     folder.save_identity(IDENTITY)
@@ -36,7 +44,9 @@ def test_paths_do_not_depend_on_the_working_directory(tmp_path, monkeypatch, sma
         assert path.parent == tmp_path / "one"
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1, 2]", "7", '{"nonsense": 1}', '{"world": 5}', b"\xff\xfe"])
+@pytest.mark.parametrize(
+    "text", ["", "{", "[1, 2]", "7", '{"nonsense": 1}', '{"world": 5}', b"\xff\xfe", "[" * 100_000]
+)
 def test_a_damaged_config_is_refused(tmp_path, text):
     (tmp_path / "config.json").write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ConfigError):

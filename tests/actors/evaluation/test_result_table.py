@@ -25,6 +25,13 @@ def test_an_empty_table_can_be_read(tmp_path):
     assert read_table(tmp_path / "results.csv") == []
 
 
+def test_a_table_that_a_spreadsheet_saved_is_read(tmp_path):
+    write_table(tmp_path / "results.csv", [ROW])
+    text = (tmp_path / "results.csv").read_text("utf-8")
+    (tmp_path / "results.csv").write_text(text.replace("\n", "\r\n"), "utf-8-sig", newline="")
+    assert read_table(tmp_path / "results.csv") == [ROW]
+
+
 def test_counts_by_outcome():
     assert [ROW.count(kind) for kind in ENDED] == [4, 3, 2, 1, 0]
     assert ROW.count(Outcome.CAPTURED) == 2

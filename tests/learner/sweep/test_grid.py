@@ -165,6 +165,7 @@ def test_settings_override_the_presets():
         ("n_stp=3", "cannot change 'n_stp'"),
         ("robots=7", "cannot change 'robots'"),
         ("seed=7", "cannot change 'seed'"),
+        pytest.param(f"hidden_sizes={'[' * 100_000}", "hidden_sizes is nested too deeply", id="nested"),
         ("final_eval_first_seed=7", "cannot change 'final_eval_first_seed'"),
         ("total_env_steps=70000", "cannot change 'total_env_steps'"),
     ],

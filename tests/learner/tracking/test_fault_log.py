@@ -31,3 +31,6 @@ def test_a_half_written_line_is_skipped_and_spoils_no_other(tmp_path):
     FaultLog(path).resumed()  # its line is appended to the half-written one
     FaultLog(path).resumed()
     assert len(read_faults(path)) == 2
+    with path.open("a") as file:
+        file.write("[" * 100_000 + "\n7\n[1]\n")
+    assert len(read_faults(path)) == 2

@@ -114,6 +114,13 @@ def test_rows_are_read_while_another_process_writes(tmp_path):
     assert read_rows(path) == [Row(1, 2, {"a": 0.5})]
 
 
+@pytest.mark.parametrize("line", ["7", "{}", "[" * 100_000, "[1, 2, 3, 4]"], ids=len)
+def test_a_line_that_is_no_row_is_refused(tmp_path, line):
+    (tmp_path / "metrics.jsonl").write_text(f"{line}\n")
+    with pytest.raises(ConfigError, match="metrics.jsonl cannot be read"):
+        read_rows(tmp_path / "metrics.jsonl")
+
+
 def test_mlflow_gets_no_accounts_and_only_the_intervals_of_the_result():
     kept = {"final/success_rate": 0.5, "final/success_rate_low": 0.4, "final/return_high": 2.0, "eval/lost_rate": 0.1}
     kept |= {"time/worker_waits": 0.1, "time/learner_samples": 0.2}
