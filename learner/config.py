@@ -97,6 +97,8 @@ class RunConfig:
     """Discount per env step, gamma (the dissertation's lambda = 0.001 cannot be a discount)."""
     n_step: int = 3
     """Env steps that a transition spans (n-step return)."""
+    random_turns: bool = False
+    """Data augmentation: every sampled transition is turned, with its heading, by a random turn of the method's."""
     batch_size: int = 256
     """Transitions per update."""
     updates_per_call: int = 64
@@ -145,6 +147,7 @@ class RunConfig:
         _check_pairs(self)
         _check_setups(self)
         _check_network(self)
+        _check_augmentation(self)
 
     @cached_property
     def env(self) -> EnvSpec:
@@ -296,6 +299,16 @@ def _check_network(config: RunConfig) -> None:
             config.env.row_size > 0,
             f"network must be plain or dueling for {config.title}, whose observations are no rows of groups; pooled is "
             "for methods in and out",
+        )
+
+
+def _check_augmentation(config: RunConfig) -> None:
+    if config.random_turns:
+        require(config.env.is_swarm, f"random_turns are for our own environment, not for {config.env_id}")
+        require(
+            config.world.method_class.turns(config.world) > 1,
+            f"random_turns must be False for method {config.world.method_name} with these settings: its state does not "
+            "turn with the world, or does so by itself",
         )
 
 

@@ -22,6 +22,7 @@ from actors.service.stopwatch import Stopwatch
 from actors.storage.fragment_writer import FragmentWriter, WriteResult, join_results
 from actors.storage.uri import Location, fetched, join_location
 from learner.config import RunConfig
+from learner.update.augmentation import RandomTurns
 from learner.update.double_dqn import importance_weights
 from learner.update.learner import Learner
 from learner.update.prefetch import NoPrefetch, Prefetch
@@ -87,9 +88,10 @@ class LearnerNode:
         self._shard_incarnations = [0] * len(shards)
         self._calls = calls
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence((config.seed, 1))))
+        self._augment = RandomTurns(config) if config.random_turns else None
         self._masses = np.zeros(len(shards), np.float64)
         self._priority_updates: dict[int, Ref[float]] = {}
-        self._samples = Prefetch(self._sample) if prefetch else NoPrefetch(self._sample)
+        self._samples = Prefetch(self._draw) if prefetch else NoPrefetch(self._draw)
         self._writer = FragmentWriter()
         self._watch = Stopwatch()
         self.publish()
@@ -162,6 +164,11 @@ class LearnerNode:
         self._weights = self._learner.weights(time.time())
         for shard in self._shards:
             self._calls.start(shard, ShardNode.publish, self._weights)
+
+    def _draw(self, count: int) -> Sample:
+        """Draws `count` rows (see `_sample`), and augments them."""
+        sample = self._sample(count)
+        return sample if self._augment is None else sample._replace(columns=self._augment(sample.columns, self._rng))
 
     def _sample(self, count: int) -> Sample:
         """Draws `count` rows from the shards in proportion to their masses, in random order."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sim_core.checks import require
 from sim_core.config import MAX_ROBOTS, WorldConfig
 from sim_core.jit import kernel
-from sim_core.methods.headings import heading_velocities, write_headings
+from sim_core.methods.headings import heading_velocities, turn_headings, write_headings
 from sim_core.methods.progress import came_closer
 from sim_core.outcomes import Outcome, end_of_step
 from sim_core.packed import packed
@@ -161,6 +161,15 @@ class Method:
         return MAX_ROBOTS if cls.fits_any_groups else config.groups
 
     @classmethod
+    def turns(cls, config: WorldConfig) -> int:
+        """Equal parts of a full turn by which observation and heading may be turned together; they divide `sectors`.
+
+        A turned world is another world of the same kind, so a turned transition is another one (data augmentation).
+        1, the default, is for methods that do not say how an observation turns.
+        """
+        return 1
+
+    @classmethod
     def check(cls, config: WorldConfig) -> None:
         """Raises ConfigError where a setting cannot work with this method."""
         require(
@@ -188,6 +197,14 @@ class Method:
         if seen.shape != out.shape:
             raise ValueError(f"observations of shape {seen.shape}, not {out.shape}")
         np.copyto(out, np.clip(seen, -self.observation_limit, self.observation_limit), "unsafe", where=mask[:, None])
+
+    def turn(self, observation: NDArray[Any], parts: NDArray[np.int64]) -> None:
+        """Turns observations `[batch, size]` in place, each counter-clockwise by `parts` `[batch]` of `turns` parts."""
+        raise NotImplementedError(f"{type(self).__name__} must define turn(self, observation, parts), as it has turns")
+
+    def turn_actions(self, action: NDArray[Any], parts: NDArray[np.int64]) -> None:
+        """Turns the headings among actions `[batch]` in place, as `turn` does; a stop stays."""
+        turn_headings(action, parts, self.config.sectors // self.turns(self.config), self.config.sectors)
 
     def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
         """Writes the learning robots' velocities `[num_worlds]` (m/s) for `action` `[num_worlds]`: u_nn of Eq. 3.4.
@@ -291,3 +308,16 @@ class CheckedMethod(Method):
             self._method.reward(state, mask, outcome, out)
         if not np.isfinite(out).all():
             raise refuse(self._cls, "reward", "gave a reward that is not finite")
+
+    def turn(self, observation: NDArray[Any], parts: NDArray[np.int64]) -> None:
+        """As `Method.turn`.
+
+        Raises:
+          PluginError: the user's code raised.
+        """
+        with guarded(self._cls, "turn"):
+            self._method.turn(observation, parts)
+
+    def turn_actions(self, action: NDArray[Any], parts: NDArray[np.int64]) -> None:
+        """As `Method.turn_actions`."""
+        self._method.turn_actions(action, parts)

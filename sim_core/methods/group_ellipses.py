@@ -43,6 +43,8 @@ ELLIPSE_COLUMNS = 7
 """a, b, x_c, y_c, theta, x_g, y_g."""
 FIELD_COLUMNS = 2
 """u_apf_x, u_apf_y."""
+THETA_TOLERANCE = 1e-6
+"""An angle above pi / 2 by less, as a share of pi, is pi / 2: float32 cannot tell them apart."""
 STEP_REWARD_SHARE = 100.0
 """A step's reward is tau divided by this (Table 4.1)."""
 
@@ -158,6 +160,23 @@ def _reward(state, mask, outcome, out, params):
         state.episode_return[world] += reward
 
 
+@kernel
+def _turn(observation, parts, turns, columns):
+    for i in range(observation.shape[0]):
+        angle = parts[i] * 2.0 * math.pi / turns
+        cos, sin = math.cos(angle), math.sin(angle)
+        for at in range(0, observation.shape[1], columns):
+            if observation[i, at] == 0:
+                continue  # the row of no group
+            theta = observation[i, at + 4] + angle
+            observation[i, at + 4] = theta - math.pi * math.ceil(theta / math.pi - 0.5 - THETA_TOLERANCE)
+            for first in (2, 5, 7):
+                if first < columns:
+                    x, y = observation[i, at + first], observation[i, at + first + 1]
+                    observation[i, at + first] = cos * x - sin * y
+                    observation[i, at + first + 1] = sin * x + cos * y
+
+
 def observation_limit(config: WorldConfig) -> float:
     """A bound of every observation: no robot gets farther from the arena's centre than its speed takes it."""
     travel_m = config.horizon_steps * config.time_step_s * config.top_speed_m_s
@@ -243,6 +262,15 @@ class EllipseMethod(Method):
             f"apf_range_m ({config.apf_range_m}) must be greater than 2 × robot_radius_m "
             f"({2 * config.robot_radius_m:.3g} m), within which robots have collided",
         )
+
+    @classmethod
+    def turns(cls, config: WorldConfig) -> int:
+        """A sector at a time; quarter turns where ellipses lie along the axes (`ellipse_covariance`)."""
+        return config.sectors if config.ellipse_covariance == "full" else math.gcd(config.sectors, 4)
+
+    def turn(self, observation: NDArray[Any], parts: NDArray[np.int64]) -> None:
+        """Turns centres, angles, goals and fields of every row."""
+        _turn(observation, parts, self.turns(self.config), self.row_size)
 
     @classmethod
     def rules(cls, config: WorldConfig) -> dict[str, Rule]:

@@ -35,6 +35,14 @@ def _write_headings(table, action, out_x, out_y):
         out_y[world] = table[action[world], 1]
 
 
+@kernel
+def turn_headings(action, parts, step, sectors):
+    """Turns headings `[batch]` in place: by `parts` `[batch]` times `step` sectors; other actions stay."""
+    for i in range(action.shape[0]):
+        if action[i] < sectors:
+            action[i] = (action[i] + parts[i] * step) % sectors
+
+
 def write_headings(table: NDArray[Any], action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
     """Writes u_nn `[num_worlds]` (m/s): row `action[world]` of `table` `[num_actions, 2]`.
 

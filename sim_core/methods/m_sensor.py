@@ -117,6 +117,16 @@ def _perceive(state, mask, out, edges, params):
             out[world, cell] = min(max(out[world, cell] + step, -COUNT_LIMIT), COUNT_LIMIT)
 
 
+@kernel
+def _turn(observation, parts, sectors, scratch):
+    for i in range(observation.shape[0]):
+        for begin in range(0, observation.shape[1], sectors):
+            for sector in range(sectors):
+                scratch[sector] = observation[i, begin + sector]
+            for sector in range(sectors):
+                observation[i, begin + (sector + parts[i]) % sectors] = scratch[sector]
+
+
 class SensorMethod(Method):
     """M_sensor: counts by sectors, velocity u_nn, Table 3.1's reward, lost or collision as failures."""
 
@@ -187,6 +197,15 @@ class SensorMethod(Method):
             return np.asarray(np.argmax(size * (inner + ring) + ring, axis=1), np.int64)
 
         return {"greedy": act}
+
+    @classmethod
+    def turns(cls, config: WorldConfig) -> int:
+        """A sector at a time; sectors that face the goal turn with the world anyway."""
+        return 1 if config.sector_frame == "goal" else config.sectors
+
+    def turn(self, observation: NDArray[Any], parts: NDArray[np.int64]) -> None:
+        """Shifts the counts of every region by `parts` sectors."""
+        _turn(observation, parts, self.config.sectors, np.zeros(self.config.sectors, observation.dtype))
 
     def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
         """Eq. 3.4: constant speed towards the chosen sector's centre, in the frame of the sectors.
