@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 from actors.evaluation.result_table import GROUPS, ROBOTS
+from actors.policy.baselines import METHOD_RULES
 from actors.rollout.exploration import Exploration
 from actors.rollout.vector_env import EnvSpec
 from sim_core import ENV_ID
@@ -121,6 +122,17 @@ class RunConfig:
     """Time constant, in updates, of the moving average of the weights, which acts, is evaluated and saved; 0: none."""
     loss: Literal["huber", "mse"] = "huber"
     """Huber loss of the TD error (quadratic up to 1, linear beyond), or mean squared error."""
+    teacher: str = "none"
+    """Rule of the method (greedy, field) whose action's value shall exceed the others' in every sampled state, beside
+    learning (Hester et al. 2018, Eq. 5); or none."""
+    teacher_margin: float = 0.1
+    """Teacher: by how much its action's value shall exceed the others'."""
+    teacher_weight: float = 1.0
+    """Teacher: weight of this loss at the start."""
+    teacher_weight_end: float = 0.1
+    """Teacher: weight after the decay."""
+    teacher_decay_env_steps: int = 3_000_000
+    """Teacher: env steps of the linear decay."""
     max_gradient_norm: float = 10.0
     """Gradients with a larger norm are scaled down to it."""
     gradients: Literal["by_hand", "autograd"] = "by_hand"
@@ -148,6 +160,7 @@ class RunConfig:
         _check_setups(self)
         _check_network(self)
         _check_augmentation(self)
+        _check_teacher(self)
 
     @cached_property
     def env(self) -> EnvSpec:
@@ -191,6 +204,11 @@ class RunConfig:
         done = min(1.0, env_steps / self.importance_exponent_env_steps)
         return self.importance_exponent_start + done * (self.importance_exponent_end - self.importance_exponent_start)
 
+    def teacher_weight_at(self, env_steps: int) -> float:
+        """Weight of the losses of the teacher's actions after `env_steps` env steps."""
+        done = min(1.0, env_steps / self.teacher_decay_env_steps)
+        return self.teacher_weight + done * (self.teacher_weight_end - self.teacher_weight)
+
     @property
     def policy_sizes(self) -> tuple[int, ...]:
         """Hidden sizes of the plain network that acts (see `actors.policy.network.snapshot`)."""
@@ -207,9 +225,9 @@ WHERE = ("engine", "device")
 """Settings that place a run and have no influence on what it learns."""
 AT_LEAST_ONE = (
     "total_env_steps workers envs_per_worker steps_per_block epsilon_decay_env_steps "
-    "learning_rate_decay_env_steps importance_exponent_env_steps replay_shards replay_capacity min_replay "
-    "n_step batch_size updates_per_call target_update_interval eval_every_env_steps eval_episodes final_eval_episodes "
-    "log_every_env_steps checkpoint_every_env_steps keep_checkpoints"
+    "learning_rate_decay_env_steps importance_exponent_env_steps teacher_decay_env_steps replay_shards replay_capacity "
+    "min_replay n_step batch_size updates_per_call target_update_interval eval_every_env_steps eval_episodes "
+    "final_eval_episodes log_every_env_steps checkpoint_every_env_steps keep_checkpoints"
 ).split()
 
 
@@ -234,6 +252,8 @@ def _check_ranges(config: RunConfig) -> None:
         config.policy_average_updates >= 0,
         f"policy_average_updates must not be negative, not {config.policy_average_updates}",
     )
+    for name in ("teacher_margin", "teacher_weight", "teacher_weight_end"):
+        require(getattr(config, name) >= 0, f"{name} must not be negative, not {getattr(config, name)}")
     require(config.ladder_exponent >= 0, f"ladder_exponent must not be negative, not {config.ladder_exponent}")
     sizes = config.hidden_sizes
     require(
@@ -309,6 +329,17 @@ def _check_augmentation(config: RunConfig) -> None:
             config.world.method_class.turns(config.world) > 1,
             f"random_turns must be False for method {config.world.method_name} with these settings: its state does not "
             "turn with the world, or does so by itself",
+        )
+
+
+def _check_teacher(config: RunConfig) -> None:
+    if config.teacher != "none":
+        require(config.env.is_swarm, f"teacher must be none for {config.env_id}: rules are for our own environment")
+        rules = ", ".join(config.world.method_class.rules(config.world))
+        require(
+            config.teacher in METHOD_RULES and config.teacher in rules,
+            f"teacher must be none or a rule of method {config.world.method_name}, which has: {rules or 'none'}; not "
+            f"{config.teacher}",
         )
 
 

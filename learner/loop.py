@@ -188,10 +188,10 @@ class TrainingLoop:
                 self._pacer.record_wait(to_insert=False)
                 return
             self._pacer.record_sample(updates)
-            learning_rate = self._config.learning_rate_at(self.env_steps)
-            exponent = self._config.importance_exponent_at(self.env_steps)
-            take = self._progress.record_updates
-            self._start(self._supervisor.learner, LearnerNode.update, take, updates, learning_rate, exponent)
+            config, take = self._config, self._progress.record_updates
+            schedules = (config.learning_rate_at, config.importance_exponent_at, config.teacher_weight_at)
+            rate, exponent, weight = (schedule(self.env_steps) for schedule in schedules)
+            self._start(self._supervisor.learner, LearnerNode.update, take, updates, rate, exponent, weight)
 
     def _start(self, placed: Placed[N], method: Callable[[N, *Ts], T], take: Callable[[T], None], *args: *Ts) -> None:
         """Starts a call of a component; `take` is called with the result once it is there."""

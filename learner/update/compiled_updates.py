@@ -4,8 +4,8 @@ For plain and pooled networks on the CPU. Small networks are bound by overhead; 
 contiguous memory, and the matrix products are those of SciPy's BLAS. The arithmetic is that of
 `learner.update.gradients` and of PyTorch's Adam on the same memory, with equal results up to rounding.
 
-One shortcut: the gradient is non-zero only for the taken action, so the last layer's backward pass needs no matrix
-product.
+One shortcut: the gradient is non-zero only for the taken action (and for a teacher's and its rival), so the last layer's
+backward pass needs no matrix product.
 """
 
 from __future__ import annotations
@@ -45,6 +45,8 @@ class _SuperBatch(NamedTuple):
     discount_t: Floats
     s_t: Floats
     weight: Floats
+    teacher: NDArray[np.int64]
+    teacher_weight: Floats
 
 
 class _Flat(NamedTuple):
@@ -63,12 +65,16 @@ class _Workspace(NamedTuple):
     `online` and `other` hold states, hidden layers and action values, `[batch, width]` each. `other` holds the
     activations of the target network first, and then the gradients with respect to the online network's activations.
     `td_target` `[batch]` are the TD targets, `grad` `[batch]` the gradient with respect to the taken action's value.
+    `rival` `[batch]` are the actions that a teacher's must exceed, `margin_grad` `[batch]` the gradient with respect to
+    their values; that of the teacher's action is its negative.
     """
 
     online: tuple[Floats, ...]
     other: tuple[Floats, ...]
     td_target: Floats
     grad: Floats
+    rival: NDArray[np.int64]
+    margin_grad: Floats
 
 
 class _Pooling(NamedTuple):
@@ -90,6 +96,7 @@ class _Hyperparameters(NamedTuple):
 
     double: bool
     huber: bool
+    margin: float
     max_norm: float
     target_interval: int
     target_rate: float
@@ -126,6 +133,7 @@ class CompiledUpdates:
         self._hyper = _Hyperparameters(
             double=config.algorithm == "double_dqn",
             huber=config.loss == "huber",
+            margin=config.teacher_margin,
             max_norm=config.max_gradient_norm,
             target_interval=config.target_update_interval,
             target_rate=config.target_update_rate if config.target_update == "soft" else 0.0,
@@ -134,13 +142,15 @@ class CompiledUpdates:
             epsilon=group["eps"],
         )
         activations, other = (make_workspace(self._size, self._layers) for _ in range(2))
-        self._workspace = _Workspace(activations, other, *np.zeros((2, self._size), np.float32))
+        td_target, grad, margin_grad = np.zeros((3, self._size), np.float32)
+        rival = np.zeros(self._size, np.int64)
+        self._workspace = _Workspace(activations, other, td_target, grad, rival, margin_grad)
         self._compile()
 
     def _compile(self) -> None:
         """Compiles the kernel for this number of layers, or loads it, before anybody waits for an update."""
-        states, column = np.zeros((0, 0), np.float32), np.zeros(0, np.float32)
-        batch = _SuperBatch(states, np.zeros(0, np.int64), column, column, states, column)
+        states, column, actions = np.zeros((0, 0), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int64)
+        batch = _SuperBatch(states, actions, column, column, states, column, actions, column)
         self._run(batch, _Flat(column, column, column, column, column), 0.0, 0, 0.0, column)
 
     def _run(
@@ -155,24 +165,26 @@ class CompiledUpdates:
 
     def __call__(self, columns: dict[str, Tensor], learning_rate: float, updates: int) -> tuple[UpdateStats, Floats]:
         """See `Updates`."""
-        state = self._state()
+        state, count = self._state(), len(columns["action"])
         batch = _SuperBatch(
             s_tm1=columns["observation"].flatten(1).numpy(),
             a_tm1=columns["action"].numpy(),
             r_t=columns["reward"].numpy(),
             discount_t=columns["discount"].numpy(),
             s_t=columns["next_observation"].flatten(1).numpy(),
-            weight=columns["weight"].numpy() if "weight" in columns else np.ones(len(columns["action"]), np.float32),
+            weight=columns["weight"].numpy() if "weight" in columns else np.ones(count, np.float32),
+            teacher=columns["teacher"].numpy() if "teacher" in columns else np.zeros(count, np.int64),
+            teacher_weight=columns["teacher_weight"].numpy() if "teacher" in columns else np.zeros(count, np.float32),
         )
         grad = self._online.values.grad
         assert grad is not None
         tensors = (self._online.values, grad, state["exp_avg"], state["exp_avg_sq"], self._target.values)
-        td_errors = np.empty(len(batch.a_tm1), np.float32)
+        td_errors = np.empty(count, np.float32)
         flat = _Flat(*(tensor.detach().numpy() for tensor in tensors))
-        count = len(td_errors) // self._size
         sums = self._run(batch, flat, learning_rate, updates, float(state["step"]), td_errors)
-        state["step"] += count
-        return UpdateStats(*(sums / count).tolist()), td_errors
+        made = count // self._size
+        state["step"] += made
+        return UpdateStats(*(sums / made).tolist()), td_errors
 
     def _state(self) -> dict[str, Tensor]:
         """Adam's state of the parameters, initialised as PyTorch does it."""
@@ -224,7 +236,8 @@ def _updates(
         _td_targets(batch, start, online, target, pooling, workspace, hyper.double)
         _forward_online(batch.s_tm1, start, online, pooling, workspace.online)
         _losses(batch, start, workspace, hyper.huber, td_errors, sums)
-        _backward(batch.a_tm1, start, online, grads, workspace)
+        _margin_losses(batch, start, workspace, np.float32(hyper.margin), sums)
+        _backward(batch, start, online, grads, workspace)
         if pooling is not None:
             _pooling_backward(online, pooling, workspace)
         updates, steps = updates + 1, steps + 1.0
@@ -310,10 +323,33 @@ def _losses(
 
 
 @inlined
-def _backward(actions: NDArray[np.int64], start: int, online: Layers, grads: Layers, workspace: _Workspace) -> None:
+def _margin_losses(
+    batch: _SuperBatch, start: int, workspace: _Workspace, margin: np.float32, sums: NDArray[np.float64]
+) -> None:
+    """Writes the rivals of the teacher's actions and the gradients of their losses (see `margin_losses`)."""
+    q_tm1, size = workspace.online[-1], len(workspace.td_target)
+    loss_sum = 0.0
+    for row in range(size):
+        workspace.margin_grad[row] = np.float32(0)
+        teacher, weight = batch.teacher[start + row], batch.teacher_weight[start + row]
+        if weight == np.float32(0):
+            continue
+        rival = 0
+        for action in range(1, q_tm1.shape[1]):
+            lead = q_tm1[row, rival] + (margin if rival != teacher else np.float32(0))
+            if q_tm1[row, action] + (margin if action != teacher else np.float32(0)) > lead:
+                rival = action
+        if rival != teacher:
+            workspace.rival[row], workspace.margin_grad[row] = rival, weight / np.float32(size)
+            loss_sum += weight * (q_tm1[row, rival] + margin - q_tm1[row, teacher])
+    sums[0] += loss_sum / size
+
+
+@inlined
+def _backward(batch: _SuperBatch, start: int, online: Layers, grads: Layers, workspace: _Workspace) -> None:
     """Backpropagates `workspace.grad` to `grads`; the hidden layers' gradients go to `workspace.other`."""
     last = len(online.weights) - 1
-    _head_backward(actions, start, online, grads, workspace)
+    _head_backward(batch, start, online, grads, workspace)
     for i in range(last - 1, -1, -1):
         delta, inputs = workspace.other[i + 1], workspace.online[i]
         _sum_rows(delta, grads.biases[i])
@@ -345,9 +381,7 @@ def _pooling_backward(online: Layers, pooling: _Pooling, workspace: _Workspace) 
 
 
 @inlined
-def _head_backward(
-    actions: NDArray[np.int64], start: int, online: Layers, grads: Layers, workspace: _Workspace
-) -> None:
+def _head_backward(batch: _SuperBatch, start: int, online: Layers, grads: Layers, workspace: _Workspace) -> None:
     """Writes the last layer's gradients, and the gradient with respect to its inputs."""
     last = len(online.weights) - 1
     weight, weight_grad, bias_grad = online.weights[last], grads.weights[last], grads.biases[last]
@@ -355,11 +389,19 @@ def _head_backward(
     weight_grad[:] = np.float32(0)
     bias_grad[:] = np.float32(0)
     for row in range(inputs.shape[0]):
-        grad, action = workspace.grad[row], actions[start + row]
+        grad, action = workspace.grad[row], batch.a_tm1[start + row]
         bias_grad[action] += grad
         for column in range(inputs.shape[1]):
             weight_grad[action, column] += grad * inputs[row, column]
             delta[row, column] = grad * weight[action, column]
+        margin_grad, rival, teacher = workspace.margin_grad[row], workspace.rival[row], batch.teacher[start + row]
+        if margin_grad != np.float32(0):
+            bias_grad[rival] += margin_grad
+            bias_grad[teacher] -= margin_grad
+            for column in range(inputs.shape[1]):
+                weight_grad[rival, column] += margin_grad * inputs[row, column]
+                weight_grad[teacher, column] -= margin_grad * inputs[row, column]
+                delta[row, column] += margin_grad * (weight[rival, column] - weight[teacher, column])
     _relu_backward(delta, inputs)
 
 

@@ -19,7 +19,8 @@ class Batch(NamedTuple):
     """A minibatch of transitions.
 
     s_tm1 and s_t are `[batch, *shape]` float32, a_tm1 `[batch]` int64, r_t and discount_t `[batch]` float32. `weight`
-    `[batch]` float32 are the importance weights of the losses, None if all are 1.
+    `[batch]` float32 are the importance weights of the losses, None if all are 1. `teacher` `[batch]` int64 are the
+    actions of a teacher in s_tm1, `teacher_weight` `[batch]` float32 the weights of their losses; None without one.
     """
 
     s_tm1: Tensor
@@ -28,6 +29,12 @@ class Batch(NamedTuple):
     discount_t: Tensor
     s_t: Tensor
     weight: Tensor | None = None
+    teacher: Tensor | None = None
+    teacher_weight: Tensor | None = None
+
+
+OPTIONAL_COLUMNS = ("weight", "teacher", "teacher_weight")
+"""Columns that only some super-batches have."""
 
 
 def minibatch(columns: dict[str, Tensor], rows: slice) -> Batch:
@@ -38,7 +45,7 @@ def minibatch(columns: dict[str, Tensor], rows: slice) -> Batch:
         columns["reward"][rows],
         columns["discount"][rows],
         columns["next_observation"][rows],
-        columns["weight"][rows] if "weight" in columns else None,
+        *(columns[name][rows] if name in columns else None for name in OPTIONAL_COLUMNS),
     )
 
 
@@ -80,6 +87,27 @@ def mean_loss(
     else:
         mean = (weight * function(chosen, fixed, reduction="none")).mean()
     return mean, (fixed - chosen).detach()
+
+
+def margin_losses(q_tm1: Tensor, teacher: Tensor, margin: float) -> Tensor:
+    """max_a [q(a) + margin (a != teacher)] - q(teacher), `[batch]`: 0 once the teacher's action leads by the margin.
+
+    Hester et al. (2018), Deep Q-learning from Demonstrations, Eq. 5.
+
+    Args:
+      q_tm1: action values `[batch, actions]`.
+      teacher: actions of the teacher `[batch]`.
+      margin: by how much their values shall exceed the others'.
+    """
+    rival = rivals(q_tm1, teacher, margin)
+    best, taught = (q_tm1.gather(1, action.unsqueeze(1)).squeeze(1) for action in (rival, teacher))
+    return best - taught + margin * (rival != teacher)
+
+
+def rivals(q_tm1: Tensor, teacher: Tensor, margin: float) -> Tensor:
+    """argmax_a [q(a) + margin (a != teacher)], `[batch]`; the lowest index among equals."""
+    raised = q_tm1.detach() + margin
+    return raised.scatter(1, teacher.unsqueeze(1), raised.gather(1, teacher.unsqueeze(1)) - margin).argmax(dim=1)
 
 
 def importance_weights(probability: NDArray[np.float64], batch_size: int, exponent: float) -> NDArray[np.float32]:

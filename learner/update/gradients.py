@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from actors.policy.network import DuelingNetwork, Network, fold_dueling_head
-from learner.update.double_dqn import Batch, LossName, mean_loss, td_targets
+from learner.update.double_dqn import Batch, LossName, margin_losses, mean_loss, rivals, td_targets
 
 Layer = tuple[Tensor, Tensor]
 """Weight `[fan_out, fan_in]` and bias `[fan_out]` of a layer, or their gradients."""
@@ -83,13 +83,17 @@ class AutogradGradients:
       online, target: the networks.
       double: Double DQN or DQN.
       loss: of the TD errors (see `mean_loss`).
+      margin: of a teacher's actions (see `margin_losses`).
     """
 
-    def __init__(self, online: FlatNetwork, target: FlatNetwork, double: bool, loss: LossName) -> None:
+    def __init__(
+        self, online: FlatNetwork, target: FlatNetwork, double: bool, loss: LossName, margin: float = 0.0
+    ) -> None:
         self._online = online
         self._target = target
         self._double = double
         self._loss = loss
+        self._margin = margin
 
     def __call__(self, batch: Batch) -> MinibatchStats:
         """Writes the loss's gradient to the online network's `values.grad`."""
@@ -99,6 +103,8 @@ class AutogradGradients:
         target = td_targets(q_t, selector, batch.r_t, batch.discount_t)
         q_tm1 = self._online.network(batch.s_tm1)
         loss, td_errors = mean_loss(q_tm1, batch.a_tm1, target, self._loss, batch.weight)
+        if batch.teacher is not None:
+            loss = loss + (batch.teacher_weight * margin_losses(q_tm1, batch.teacher, self._margin)).mean()
         assert self._online.values.grad is not None
         self._online.values.grad.zero_()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -112,11 +118,14 @@ class HandWrittenGradients:
     folded into one layer for the forward pass, and that layer's gradients are unfolded in the backward pass.
     """
 
-    def __init__(self, online: FlatNetwork, target: FlatNetwork, double: bool, loss: LossName) -> None:
+    def __init__(
+        self, online: FlatNetwork, target: FlatNetwork, double: bool, loss: LossName, margin: float = 0.0
+    ) -> None:
         self._online = online
         self._target = target
         self._double = double
         self._loss = loss
+        self._margin = margin
 
     @torch.no_grad()
     def __call__(self, batch: Batch) -> MinibatchStats:
@@ -134,6 +143,11 @@ class HandWrittenGradients:
         if batch.weight is not None:
             losses, grad = batch.weight * losses, batch.weight * grad
         delta = torch.zeros_like(q_tm1).scatter_(1, action, grad.div(-size).unsqueeze(1))
+        if batch.teacher is not None and batch.teacher_weight is not None:
+            losses = losses + batch.teacher_weight * margin_losses(q_tm1, batch.teacher, self._margin)
+            share = batch.teacher_weight.div(size).unsqueeze(1)
+            delta.scatter_add_(1, rivals(q_tm1, batch.teacher, self._margin).unsqueeze(1), share)
+            delta.scatter_add_(1, batch.teacher.unsqueeze(1), -share)
         self._backward(layers, [layer[:size] for layer in activations[:-1]], delta)
         return MinibatchStats(losses.mean(), q_tm1.mean(), td_errors.abs().mean(), td_errors)
 

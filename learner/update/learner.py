@@ -21,6 +21,8 @@ from learner.update.updates import TorchUpdates, Updates, UpdateStats
 from sim_core.checks import require
 
 COLUMNS = ("reward", "discount", "action", "observation", "next_observation")
+TEACHER_COLUMNS = ("teacher", "teacher_weight")
+"""Columns that are there with a teacher."""
 Rows = NDArray[Any] | dict[str, NDArray[Any]]
 """Transitions: rows of `actors.service.messages.transition_dtype`, or their columns by name."""
 
@@ -150,10 +152,11 @@ class Columns:
 
     def __call__(self, rows: Rows) -> dict[str, Tensor]:
         """The columns of `rows`, `[rows, ...]` each."""
-        return {name: self._column(name, rows[name]) for name in COLUMNS}
+        taught = TEACHER_COLUMNS if isinstance(rows, dict) and "teacher" in rows else ()
+        return {name: self._column(name, rows[name]) for name in (*COLUMNS, *taught)}
 
     def _column(self, name: str, column: NDArray[Any]) -> Tensor:
-        wanted = np.int64 if name == "action" else np.float32
+        wanted = np.int64 if name in ("action", "teacher") else np.float32
         if column.dtype == wanted and column.flags.c_contiguous and column.flags.writeable:
             return torch.from_numpy(column)
         tensor = self._tensors.get(name)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from actors.policy.baselines import Baseline, MethodRule
 from actors.policy.policy import WeightsSnapshot
 from actors.replay.node import ShardNode
 from actors.rollout.vector_env import EnvShape
@@ -89,6 +90,7 @@ class LearnerNode:
         self._calls = calls
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence((config.seed, 1))))
         self._augment = RandomTurns(config) if config.random_turns else None
+        self._teacher = None if config.teacher == "none" else MethodRule(config.world, Baseline(config.teacher))
         self._masses = np.zeros(len(shards), np.float64)
         self._priority_updates: dict[int, Ref[float]] = {}
         self._samples = Prefetch(self._draw) if prefetch else NoPrefetch(self._draw)
@@ -129,7 +131,9 @@ class LearnerNode:
         except CallFailed as failure:
             raise failure.of(Component(ComponentKind.SHARD, index), self._shard_incarnations[index]) from failure
 
-    def update(self, updates: int, learning_rate: float, importance_exponent: float = 1.0) -> UpdateReport:
+    def update(
+        self, updates: int, learning_rate: float, importance_exponent: float = 1.0, teacher_weight: float = 0.0
+    ) -> UpdateReport:
         """Samples a super-batch, makes `updates` updates of it, and publishes the weights.
 
         With prioritised shards, the sample is weighted and its TD errors go back to the shards that it came from.
@@ -138,6 +142,7 @@ class LearnerNode:
           updates: how many, one minibatch each.
           learning_rate: Adam's.
           importance_exponent: beta of the importance weights (prioritised shards only).
+          teacher_weight: of the losses of the teacher's actions (with a teacher only).
 
         Raises:
           ComponentFailed: a shard failed, and no update was made.
@@ -149,6 +154,8 @@ class LearnerNode:
         if sample.draws is not None:
             weights = importance_weights(sample.draws.probability, self._batch_size, importance_exponent)
         self._samples.begin(count)
+        if self._teacher is not None:
+            sample.columns["teacher_weight"] = np.full(count, teacher_weight, np.float32)
         stats = self._learner.update(sample.columns, learning_rate, weights)
         self._watch.lap(UPDATES)
         if sample.draws is not None:
@@ -166,9 +173,12 @@ class LearnerNode:
             self._calls.start(shard, ShardNode.publish, self._weights)
 
     def _draw(self, count: int) -> Sample:
-        """Draws `count` rows (see `_sample`), and augments them."""
+        """Draws `count` rows (see `_sample`), augments them, and asks the teacher what it would have done."""
         sample = self._sample(count)
-        return sample if self._augment is None else sample._replace(columns=self._augment(sample.columns, self._rng))
+        columns = sample.columns if self._augment is None else self._augment(sample.columns, self._rng)
+        if self._teacher is not None:
+            columns = columns | {"teacher": self._teacher.act(columns["observation"])}
+        return sample._replace(columns=columns)
 
     def _sample(self, count: int) -> Sample:
         """Draws `count` rows from the shards in proportion to their masses, in random order."""

@@ -32,7 +32,7 @@ class Updates(Protocol):
 
         Args:
           columns: of a super-batch, `[rows, ...]` on the CPU; rows is a multiple of `batch_size`. `weight` is missing
-            where all importance weights are 1.
+            where all importance weights are 1, `teacher` and `teacher_weight` where there is no teacher.
           learning_rate: Adam's.
           updates: made before this call.
 
@@ -57,7 +57,7 @@ class TorchUpdates:
         self._online, self._target, self._optimiser, self._config = online, target, optimiser, config
         double = config.algorithm == "double_dqn"
         kind = "autograd" if config.network == "pooled" else config.gradients  # by hand only in compiled updates
-        self._gradients = GRADIENTS[kind](online, target, double, config.loss)
+        self._gradients = GRADIENTS[kind](online, target, double, config.loss, config.teacher_margin)
 
     def __call__(
         self, columns: dict[str, Tensor], learning_rate: float, updates: int

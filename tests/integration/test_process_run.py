@@ -34,6 +34,8 @@ OPTIONS = {
     "loss": "mse",
     "target_update": "soft",
     "learning_rate_schedule": "cosine",
+    "random_turns": True,
+    "teacher": "greedy",
 }
 
 
@@ -150,7 +152,10 @@ def test_a_resumed_run_of_several_setups_is_the_uninterrupted_one(small, tmp_pat
 
 def test_a_resumed_run_of_a_pooled_network_is_the_uninterrupted_one(small, tmp_path):
     world = dataclasses.replace(small.world, method="out", robots=3, groups=2, group_rows=5)
-    whole = dataclasses.replace(small, world=world, setups=("3x2", "4x5"), network="pooled", hidden_sizes=(16, 16))
+    taught = {"random_turns": True, "teacher": "greedy"}
+    whole = dataclasses.replace(
+        small, world=world, setups=("3x2", "4x5"), network="pooled", hidden_sizes=(16, 16), **taught
+    )
     names = resumed_arrays(whole, tmp_path)
     assert "learner/online.rows.0.weight" in names
 

@@ -39,6 +39,11 @@ def test_counts_must_be_positive_whole_numbers(name, value):
         ("learning_rate", [0, -1, math.nan, math.inf]),
         ("learning_rate_end", [0, -1, math.nan, math.inf]),
         ("max_gradient_norm", [0, -1, math.nan]),
+        ("teacher_weight", [-0.1, math.nan, math.inf, "1"]),
+        ("teacher_weight_end", [-0.1, math.nan, math.inf]),
+        ("teacher_margin", [-0.1, math.nan, math.inf]),
+        ("teacher", ["dqn", None, 3]),
+        ("random_turns", [1, "yes", None]),
         ("target_update_rate", [0, -0.1, 1.01, math.nan, None]),
         ("priority_exponent", [-0.1, 1.1, math.nan]),
         ("importance_exponent_start", [-0.1, 1.1, "0.4"]),
@@ -88,6 +93,14 @@ OTHER = WorldConfig(method="in")
         ),
         ({"network": "pooled"}, "network must be plain or dueling for sensor 10r×2g"),
         ({"network": "pooled", "env_id": "CartPole-v1"}, "network must be plain or dueling for CartPole-v1"),
+        ({"teacher": "field"}, "teacher must be none or a rule of method sensor, which has: greedy; not field"),
+        ({"teacher": "fl-orca", "world": OTHER}, "rule of method in, which has: greedy, field; not fl-orca"),
+        ({"teacher": "greedy", "env_id": "CartPole-v1"}, "teacher must be none for CartPole-v1"),
+        ({"random_turns": True, "env_id": "CartPole-v1"}, "random_turns are for our own environment, not for CartPole"),
+        (
+            {"random_turns": True, "world": WorldConfig(sector_frame="goal")},
+            "random_turns must be False for method sensor with these settings",
+        ),
         ({"setups": "all"}, "setups must be a list of texts such as 10x2, not 'all'"),
     ],
 )
@@ -116,6 +129,12 @@ def test_the_learning_rate_falls_linearly_and_stays():
     config = RunConfig(learning_rate=1e-3, learning_rate_end=2e-4, learning_rate_decay_env_steps=1000)
     rates = [config.learning_rate_at(env_steps) for env_steps in (0, 250, 1000, 10**9)]
     assert rates == pytest.approx([1e-3, 8e-4, 2e-4, 2e-4])
+
+
+def test_a_teachers_weight_falls_linearly_and_stays():
+    config = RunConfig(teacher="greedy", teacher_weight=2.0, teacher_weight_end=0.5, teacher_decay_env_steps=1000)
+    weights = [config.teacher_weight_at(env_steps) for env_steps in (0, 500, 1000, 10**9)]
+    assert weights == pytest.approx([2.0, 1.25, 0.5, 0.5])
 
 
 def test_a_learning_rate_that_ends_where_it_starts_is_constant():
@@ -198,6 +217,8 @@ def changed(config, name):
         "world": dataclasses.replace(config.world, reward_scale=2.0),
         "hidden_sizes": (*config.hidden_sizes, 4),
         "setups": ("4x2", "5x1"),
+        "random_turns": True,
+        "teacher": "greedy",
     }
     if name not in others:
         others[name] = value + 1 if isinstance(value, int) else value / 2

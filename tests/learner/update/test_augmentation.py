@@ -6,7 +6,6 @@ from scipy.stats import chisquare
 
 from learner.config import RunConfig
 from learner.update.augmentation import RandomTurns
-from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 
 ROWS = 4_000
@@ -50,10 +49,3 @@ def test_columns_that_cannot_be_written_are_copied():
     assert not np.array_equal(made["observation"], before["observation"])
     for name, column in before.items():
         np.testing.assert_array_equal(given[name], column)
-
-
-def test_states_without_turns_are_refused():
-    with pytest.raises(ConfigError, match="random_turns must be False for method sensor with these settings"):
-        config("sensor", sector_frame="goal")
-    with pytest.raises(ConfigError, match="random_turns are for our own environment, not for CartPole-v1"):
-        RunConfig(env_id="CartPole-v1", random_turns=True)

@@ -48,7 +48,7 @@ def with_absent_rows(columns, rows, row_size, most):
 
 
 @pytest.mark.parametrize("most", [0, 8])
-@pytest.mark.parametrize("options", [{}, {"loss": "mse"} | SOFT, {"algorithm": "dqn"}])
+@pytest.mark.parametrize("options", [{}, {"loss": "mse"} | SOFT, {"algorithm": "dqn"}, {"teacher_margin": 0.2}])
 @pytest.mark.parametrize(("rows", "row_size", "hidden_sizes"), ROWS)
 def test_an_update_of_a_pooled_network_equals_that_of_autograd(
     learner_config, rows, row_size, hidden_sizes, options, most
@@ -58,6 +58,7 @@ def test_an_update_of_a_pooled_network_equals_that_of_autograd(
     compiled, online, target, _ = pooled_maker(CompiledUpdates, config, rows, row_size)
     plain, other_online, other_target, _ = pooled_maker(TorchUpdates, config, rows, row_size)
     columns = with_absent_rows(columns_of(5 * 24, (rows * row_size,), 6), rows, row_size, most)
+    columns = taught(columns, 6) if "teacher_margin" in options else columns
     stats, errors = compiled(columns, RATE, 7)
     expected, expected_errors = plain(columns, RATE, 7)
     np.testing.assert_allclose(stats, expected, rtol=2e-5, atol=2e-6)
@@ -69,6 +70,15 @@ def test_an_update_of_a_pooled_network_equals_that_of_autograd(
     for flat, other in ((online, other_online), (target, other_target)):
         apart = (flat.values - other.values).detach().abs().mean()
         assert float(apart) < 2e-3 * RATE
+
+
+def taught(columns, num_actions):
+    """The columns, with a teacher in two of three rows."""
+    rng = np.random.default_rng(4)
+    count = len(columns["action"])
+    weight = rng.uniform(0.2, 2.0, size=count) * (np.arange(count) % 3 > 0)
+    teacher = torch.from_numpy(rng.integers(num_actions, size=count))
+    return columns | {"teacher": teacher, "teacher_weight": torch.from_numpy(weight.astype(np.float32))}
 
 
 def columns_of(count, shape, num_actions, seed=0, weighted=False):
@@ -86,7 +96,7 @@ def columns_of(count, shape, num_actions, seed=0, weighted=False):
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("options", [{}, {"loss": "mse"}, SOFT, {"max_gradient_norm": 100.0}])
+@pytest.mark.parametrize("options", [{}, {"loss": "mse"}, SOFT, {"max_gradient_norm": 100.0}, {"teacher_margin": 0.3}])
 @pytest.mark.parametrize("algorithm", ["double_dqn", "dqn"])
 @pytest.mark.parametrize(("shape", "hidden_sizes", "num_actions", "size"), SHAPES)
 def test_an_update_equals_that_of_autograd(
@@ -97,6 +107,7 @@ def test_an_update_equals_that_of_autograd(
     compiled, online, target, optimiser = maker(CompiledUpdates, config, shape, num_actions)
     plain, other_online, other_target, other_optimiser = maker(TorchUpdates, config, shape, num_actions)
     columns = columns_of(5 * size, shape, num_actions, weighted=weighted)
+    columns = taught(columns, num_actions) if "teacher_margin" in options else columns
     stats, errors = compiled(columns, RATE, 7)
     expected, expected_errors = plain(columns, RATE, 7)
     np.testing.assert_allclose(stats, expected, rtol=2e-5, atol=2e-6)

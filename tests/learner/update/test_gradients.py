@@ -14,7 +14,7 @@ def networks(observation_size, hidden_sizes, num_actions, seed=0, kind="plain"):
     return [FlatNetwork(make_network(kind, observation_size, hidden_sizes, num_actions)) for _ in range(2)]
 
 
-def random_batch(size, shape, num_actions, seed=0, weighted=False):
+def random_batch(size, shape, num_actions, seed=0, weighted=False, taught=False):
     rng = np.random.default_rng(seed)
 
     def tensor(array):
@@ -27,6 +27,8 @@ def random_batch(size, shape, num_actions, seed=0, weighted=False):
         discount_t=tensor(rng.choice([0.0, 0.97], size=size)),
         s_t=tensor(rng.normal(size=(size, *shape))),
         weight=tensor(rng.uniform(0.1, 1.0, size=size)) if weighted else None,
+        teacher=torch.from_numpy(rng.integers(num_actions, size=size)) if taught else None,
+        teacher_weight=tensor(rng.uniform(0.0, 2.0, size=size)) if taught else None,
     )
 
 
@@ -37,14 +39,17 @@ def random_batch(size, shape, num_actions, seed=0, weighted=False):
     ("shape", "hidden_sizes", "num_actions", "size"),
     [((16,), (128, 128), 8, 256), ((72,), (256, 256), 9, 64), ((3,), (5,), 2, 1), ((2, 4), (7, 6, 5), 4, 33)],
 )
-def test_hand_written_gradients_equal_autograd(double, shape, hidden_sizes, num_actions, size, loss, weighted, kind):
+@pytest.mark.parametrize("taught", [False, True])
+def test_hand_written_gradients_equal_autograd(
+    double, shape, hidden_sizes, num_actions, size, loss, weighted, kind, taught
+):
     online, target = networks(int(np.prod(shape)), hidden_sizes, num_actions, kind=kind)
-    batch = random_batch(size, shape, num_actions, weighted=weighted)
+    batch = random_batch(size, shape, num_actions, weighted=weighted, taught=taught)
     online.values.grad.fill_(torch.nan)  # an element that is not written would show
-    found = HandWrittenGradients(online, target, double, loss)(batch)
+    found = HandWrittenGradients(online, target, double, loss, 0.3)(batch)
     by_hand = online.values.grad.clone()
     online.values.grad.fill_(torch.nan)
-    expected = AutogradGradients(online, target, double, loss)(batch)
+    expected = AutogradGradients(online, target, double, loss, 0.3)(batch)
     assert float(by_hand.abs().max()) > 1e-3
     scale = float(online.values.grad.abs().max())
     torch.testing.assert_close(by_hand, online.values.grad, rtol=1e-4, atol=3e-6 * scale)

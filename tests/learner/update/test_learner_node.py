@@ -10,14 +10,17 @@ from scipy import stats
 from actors.policy.policy import Policy, WeightsSnapshot
 from actors.replay.node import ShardNode, ShardSettings
 from actors.replay.prioritised import PRIORITY_EPSILON, PrioritySettings
+from actors.rollout.vector_env import env_shape
 from actors.rollout.worker import join_stats
-from actors.service.messages import SCHEMA_VERSION, BlockHeader, TransitionBlock
+from actors.service.messages import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
 from actors.service.rpc import Done, LocalCalls
 from actors.service.stopwatch import Stopwatch
+from learner.config import RunConfig
 from learner.update import learner_node as node_module
 from learner.update.double_dqn import importance_weights
 from learner.update.learner import Learner
 from learner.update.learner_node import LearnerNode
+from sim_core.config import WorldConfig
 from tests.checkpointing import saved
 from tests.packed import as_rows, pack
 
@@ -381,6 +384,27 @@ def test_a_checkpoint_waits_for_priority_updates(tmp_path, make_learner, make_ro
     assert shard.mass() == 50
     state = learner.save(tmp_path)
     assert shard.mass() != 50 and state["sizes"] == [shard.mass()]
+
+
+def test_a_teachers_action_leads_after_updates_with_its_weight_and_not_without():
+    """Its action is the rule's in the sampled state, also after a random turn of it."""
+    world = WorldConfig(method="in", robots=3, groups=2)
+    config = RunConfig(
+        world=world, teacher="field", teacher_margin=1.0, random_turns=True, min_replay=1, hidden_sizes=(64,)
+    )
+    shape = env_shape(config.env)
+    states = np.random.default_rng(0).normal(size=(512, *shape.observation_space.shape)).astype(np.float32)
+    rule = world.method_class.rules(world)["field"]
+    agreements = []
+    for weight in (1.0, 0.0):
+        rows = np.zeros(512, transition_dtype(shape.observation_space))
+        rows["observation"] = rows["next_observation"] = states
+        learner = LearnerNode(config, shape, [ShardNode(ShardSettings(rows.dtype, 512, 0))], LocalCalls())
+        learner.add(make_block(rows))
+        for _ in range(40):
+            learner.update(8, 3e-3, teacher_weight=weight)
+        agreements.append(float((Policy(learner.weights()).greedy(states) == rule(states)).mean()))
+    assert agreements[0] > 0.8 > 0.4 > agreements[1]
 
 
 def test_divergence_ends_the_run(make_learner, make_rows):
