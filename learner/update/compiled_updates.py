@@ -4,8 +4,8 @@ For plain and pooled networks on the CPU. Small networks are bound by overhead; 
 contiguous memory, and the matrix products are those of SciPy's BLAS. The arithmetic is that of
 `learner.update.gradients` and of PyTorch's Adam on the same memory, with equal results up to rounding.
 
-One shortcut: the gradient is non-zero only for the taken action (and for a teacher's and its rival), so the last layer's
-backward pass needs no matrix product.
+One shortcut: the gradient is non-zero only for the taken action (and for a teacher's and its rival), so the last
+layer's backward pass needs no matrix product.
 """
 
 from __future__ import annotations

@@ -103,7 +103,7 @@ class AutogradGradients:
         target = td_targets(q_t, selector, batch.r_t, batch.discount_t)
         q_tm1 = self._online.network(batch.s_tm1)
         loss, td_errors = mean_loss(q_tm1, batch.a_tm1, target, self._loss, batch.weight)
-        if batch.teacher is not None:
+        if batch.teacher is not None and batch.teacher_weight is not None:
             loss = loss + (batch.teacher_weight * margin_losses(q_tm1, batch.teacher, self._margin)).mean()
         assert self._online.values.grad is not None
         self._online.values.grad.zero_()
