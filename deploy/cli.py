@@ -24,7 +24,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import tyro  # noqa: E402
 
 from actors.service.fault_policy import RunFailed  # noqa: E402
-from deploy.options.results import Dashboard, Evaluate, Export, Report, Watch  # noqa: E402
+from deploy.options.results import Dashboard, Evaluate, Export, Relocate, Report, Watch  # noqa: E402
 from deploy.options.training import Chaos, Resume, Submit, Sweep, Train, ray_address  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
 from learner.presets import TrainingPreset, preset_config  # noqa: E402
@@ -34,7 +34,7 @@ from sim_core.checks import ConfigError, require, require_packages  # noqa: E402
 FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
-Command = Train | Sweep | Report | Resume | Evaluate | Watch | Chaos | Export | Submit | Dashboard
+Command = Train | Sweep | Report | Resume | Evaluate | Watch | Chaos | Export | Submit | Dashboard | Relocate
 COMMANDS: dict[type[Command], str] = {
     Train: "train",
     Sweep: "sweep",
@@ -46,6 +46,7 @@ COMMANDS: dict[type[Command], str] = {
     Export: "export",
     Submit: "submit",
     Dashboard: "dashboard",
+    Relocate: "relocate",
 }
 """Every command's name, by its options, in the order of the help text."""
 CONFIGS = Path(__file__).parent / "configs"

@@ -13,8 +13,9 @@ from learner.checkpoints.checkpoint import Checkpoint
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig, check_files_unchanged
 from learner.run import RunResult, RunSession
-from learner.run_folder import RunFolder, RunIdentity
+from learner.run_folder import RunFolder
 from learner.tracking.journal import Row
+from learner.tracking.local_store import find_store
 from learner.tracking.mlflow_run import Tracker
 from learner.tracking.redaction import full_uri, public_uri
 from learner.update.learner import learning_device
@@ -26,9 +27,14 @@ def check_device(config: RunConfig, address: str | None) -> None:
         learning_device(config.device)
 
 
-def open_tracker(identity: RunIdentity) -> Tracker:
-    """The MLflow tracker of a run that exists already."""
-    return Tracker(full_uri(identity.tracking_uri), identity.experiment, None)
+def open_tracker(folder: RunFolder) -> Tracker:
+    """The MLflow tracker of a run that exists already.
+
+    Raises:
+      ConfigError: its store cannot be opened, or has gone.
+    """
+    identity = folder.identity()
+    return Tracker(full_uri(find_store(identity.tracking_uri, identity.mlflow_run_id, folder.path)), None, None)
 
 
 def print_resume_point(checkpoint: Checkpoint, skipped: list[str]) -> None:
@@ -48,7 +54,9 @@ def resume_training(
     """
     check_files_unchanged(config)
     check_device(config, options.address)
-    tracker.resume(folder.identity().mlflow_run_id)
+    identity = folder.identity()
+    tracker.resume(identity.mlflow_run_id)
+    folder.save_identity(identity._replace(tracking_uri=public_uri(tracker.uri)))
     folder.save_config(config)
     return run_training(folder, config, tracker, checkpoint, options)
 

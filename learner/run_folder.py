@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -54,6 +55,11 @@ class RunFolder:
         """Whether a run has been started here that can be resumed."""
         return self._identity.is_file()
 
+    def is_taken(self) -> bool:
+        """Whether there is anything here; a lock alone is what a start leaves that was refused."""
+        here = self.path
+        return here.exists() and not (here.is_dir() and {each.name for each in here.iterdir()} <= {file_names.LOCK})
+
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Locks the run against training by other processes; the lock ends with the `with` block or the process.
@@ -87,7 +93,10 @@ class RunFolder:
         return from_dict(_read(self.path / file_names.CONFIG))
 
     def save_storage(self, storage: Storage) -> None:
-        """Writes `storage.json`."""
+        """Writes `storage.json`; a folder beside the run is named relative to it, so that both can be moved."""
+        url, runs = storage.checkpoint_url, self.path.parent
+        if url is not None and os.path.isabs(url) and runs in Path(url).parents:
+            storage = storage._replace(checkpoint_url=os.path.relpath(url, self.path))
         write_json(self.path / file_names.STORAGE, storage._asdict())
 
     def storage(self) -> Storage:
@@ -111,7 +120,10 @@ class RunFolder:
     def checkpoint_location(self) -> Location:
         """Location of the run's checkpoints (see `storage` for errors)."""
         url = self.storage().checkpoint_url
-        return self.checkpoints if url is None else parse_location(url)
+        if url is None:
+            return self.checkpoints
+        is_beside = "://" not in url and not os.path.isabs(url)
+        return parse_location(os.path.normpath(self.path / url) if is_beside else url)
 
     def save_identity(self, identity: RunIdentity) -> None:
         """Writes `run.json`."""

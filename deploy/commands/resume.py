@@ -24,7 +24,7 @@ def run(command: Resume) -> int:
         checkpoint, skipped = resume_point(folder, config)
         config = _extended(config, command.total_env_steps, checkpoint.state["env_steps"])
         config = dataclasses.replace(config, device=command.device or config.device)
-        tracker = open_tracker(folder.identity())
+        tracker = open_tracker(folder)
         print_resume_point(checkpoint, skipped)
         return resume_training(folder, config, tracker, checkpoint, command.cluster_options())
 

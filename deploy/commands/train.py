@@ -55,8 +55,9 @@ def run(command: Train) -> int:
     check_device(config, launch.ray_address())
     storage = new_storage(command.checkpoint_url, folder.path.name, command.keep_best)
     tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
-    tracker.start(config)
     with folder.lock():
+        _check_free(folder, not folder.has_begun())  # another process may have begun it meanwhile
+        tracker.start(config)
         folder.save_storage(storage)
         folder.save_config(config)
         folder.save_identity(RunIdentity(config.name, public_uri(tracker.uri), launch.experiment, tracker.run_id))
@@ -66,12 +67,17 @@ def run(command: Train) -> int:
 def _run_folder(config: RunConfig, launch: Launch, or_resume: bool) -> RunFolder:
     """The run's folder; raises ConfigError if it exists and must not."""
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    folder = launch.runs_dir / (launch.name or f"{default_name(config)}-{stamp}")
+    folder = RunFolder(launch.runs_dir / (launch.name or f"{default_name(config)}-{stamp}"))
+    _check_free(folder, or_resume)
+    return folder
+
+
+def _check_free(folder: RunFolder, may_exist: bool) -> None:
+    """Raises ConfigError if the folder holds a run, or anything else, and must not."""
     require(
-        or_resume or not folder.exists(),
-        f"{folder} exists already; choose another --name, or resume it with `shoal resume {folder.name}`",
+        may_exist or not folder.is_taken(),
+        f"{folder.path} exists already; choose another --name, or resume it with `shoal resume {folder.path.name}`",
     )
-    return RunFolder(folder)
 
 
 def _check_storage(folder: RunFolder, checkpoint_url: str | None) -> None:
@@ -91,9 +97,8 @@ def _resume(folder: RunFolder, config: RunConfig, options: ClusterOptions) -> in
         config_hash(known) == config_hash(config),
         f"{folder.path} holds a run of other settings; choose another --name",
     )
-    identity = folder.identity()
-    tracker = open_tracker(identity)
-    if config.total_env_steps <= known.total_env_steps and tracker.is_finished(identity.mlflow_run_id):
+    tracker = open_tracker(folder)
+    if config.total_env_steps <= known.total_env_steps and tracker.is_finished(folder.identity().mlflow_run_id):
         plain_console().print(f"run {folder.path} has finished before", soft_wrap=True)
         return 0
     checkpoint = None

@@ -160,5 +160,16 @@ class Dashboard:
         require(not self.serve or self.out is None, "--serve writes no file; leave out --out or --serve")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Relocate:
+    """Let MLflow find its artifacts again after a folder of runs was moved or copied.
+
+    `shoal train`, `resume` and `sweep` do so by themselves; MLflow's own page and clients need it.
+    """
+
+    runs_dir: Path = Path("runs")
+    """Folder of all runs, where it is now."""
+
+
 def _check_port(port: int) -> None:
     require(0 <= port <= 65535, f"--port must be in 0..65535, not {port}")

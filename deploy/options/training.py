@@ -13,6 +13,8 @@ from learner.cluster_options import DEADLINE_S, START_DEADLINE_S, ClusterOptions
 from learner.config import RunConfig
 from learner.presets import TrainingPreset
 from learner.sweep.grid import SweepConfig
+from learner.tracking.local_store import ARTIFACTS, DATABASE, sqlite_uri
+from learner.tracking.redaction import VARIABLE
 from sim_core.checks import require
 
 
@@ -60,12 +62,11 @@ class Launch(RayOptions):
 
     def tracking(self) -> str:
         """The tracking URI in force."""
-        default = f"sqlite:///{self.runs_dir.absolute() / 'mlflow.db'}"
-        return self.tracking_uri or os.environ.get("MLFLOW_TRACKING_URI") or default
+        return self.tracking_uri or os.environ.get(VARIABLE) or sqlite_uri(self.runs_dir / DATABASE)
 
     def artifact_root(self) -> str | None:
         """Artifact folder of a new experiment: beside a local database; None leaves the choice to the server."""
-        return str(self.runs_dir.absolute() / "mlartifacts") if self.tracking().startswith("sqlite:") else None
+        return str(self.runs_dir.absolute() / ARTIFACTS) if self.tracking().startswith("sqlite:") else None
 
     def sweep_experiment(self, name: str) -> str:
         """MLflow experiment of the sweep `name`: the given one, or one of its own."""

@@ -6,7 +6,9 @@ import hashlib
 import logging
 import math
 import os
+import shlex
 import socket
+import sqlite3
 import subprocess
 import time
 import warnings
@@ -26,8 +28,9 @@ from actors.service.fault_policy import first_line
 from learner.config import RunConfig, config_hash, flat_params, user_files
 from learner.file_names import USER_FILES
 from learner.tracking.journal import FINAL, Row, mlflow_metrics
+from learner.tracking.local_store import opening
 from learner.tracking.mlflow_views import TAG, packed_view, sweep_views
-from learner.tracking.redaction import hide_secrets, public_uri
+from learner.tracking.redaction import VARIABLE, hide_secrets, public_uri
 from learner.update.networks import acting_network
 from sim_core.checks import ConfigError
 
@@ -37,9 +40,10 @@ os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "30")
 
 import mlflow  # noqa: E402
 import mlflow.pytorch  # noqa: E402
-from mlflow.entities import Metric, Param, RunTag  # noqa: E402
+from mlflow.entities import Experiment, LifecycleStage, Metric, Param, RunTag  # noqa: E402
 from mlflow.exceptions import MlflowException  # noqa: E402
 from mlflow.models import infer_signature  # noqa: E402
+from mlflow.protos.databricks_pb2 import RESOURCE_ALREADY_EXISTS, ErrorCode  # noqa: E402
 from requests import RequestException  # noqa: E402
 from sqlalchemy.exc import SQLAlchemyError  # noqa: E402
 
@@ -81,31 +85,59 @@ class Tracker:
 
     Args:
       uri: tracking URI.
-      experiment: experiment name; created if missing.
+      experiment: experiment name; created if missing. None for a run that is resumed, which has one.
       artifact_root: where a new experiment stores its artifacts, None for the server's default.
 
     Raises:
-      ConfigError: the store cannot be opened.
+      ConfigError: the store cannot be opened, or the experiment is deleted.
     """
 
-    def __init__(self, uri: str, experiment: str, artifact_root: str | None) -> None:
+    def __init__(self, uri: str, experiment: str | None, artifact_root: str | None) -> None:
         check_reachable(uri)
         self.uri = uri
         self.run_id = ""
         self.started_ms = 0
         """Start of the run in ms since the epoch."""
         self._logged: set[tuple[str, int]] = set()
+        self._experiment_id = ""
         try:
-            self._client = mlflow_client(uri)
-            found = self._client.get_experiment_by_name(experiment)
-            self._experiment_id = (
-                found.experiment_id if found else self._client.create_experiment(experiment, artifact_root)
-            )
-        except (MlflowException, SQLAlchemyError, OSError, ValueError, ImportError) as error:
+            with opening(uri):
+                self._client = mlflow_client(uri)
+                if experiment is not None:
+                    self._experiment_id = self._experiment(experiment, artifact_root)
+        except (MlflowException, SQLAlchemyError, sqlite3.Error, OSError, ValueError, ImportError) as error:
             reason = hide_secrets(first_line(error), uri)
             raise ConfigError(
                 f"the MLflow store {public_uri(uri)} cannot be opened ({reason}); name another --tracking-uri"
             ) from error
+
+    def _experiment(self, name: str, artifact_root: str | None) -> str:
+        """Id of the experiment, which is made if it is missing.
+
+        Raises:
+          ConfigError: it is deleted.
+        """
+        found = self._client.get_experiment_by_name(name)
+        if found is None:
+            try:
+                return str(self._client.create_experiment(name, artifact_root))
+            except MlflowException as error:
+                found = self._client.get_experiment_by_name(name)  # another process may have made it meanwhile
+                if found is None or error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
+                    raise
+        self._refuse_deleted(found)
+        return str(found.experiment_id)
+
+    def _refuse_deleted(self, experiment: Experiment) -> None:
+        if experiment.lifecycle_stage == LifecycleStage.DELETED:
+            restore = f"mlflow experiments restore -x {experiment.experiment_id}"
+            raise ConfigError(
+                f"the experiment {experiment.name!r} is deleted in the MLflow store {public_uri(self.uri)}: restore it "
+                f"(`{self._variable()} {restore}`), or start a run with another --experiment"
+            )
+
+    def _variable(self) -> str:
+        return f"{VARIABLE}={shlex.quote(public_uri(self.uri))}"
 
     @property
     def retry_timeout_s(self) -> float:
@@ -165,16 +197,24 @@ class Tracker:
         """Continues an existing run; its tag `attempts` counts the run's sessions.
 
         Raises:
-          ConfigError: the store does not know it.
+          ConfigError: the store does not know it, or it is deleted.
         """
         try:
             run = self._client.get_run(run_id)
+            self._experiment_id = run.info.experiment_id
+            self._refuse_deleted(self._client.get_experiment(self._experiment_id))
+            if run.info.lifecycle_stage == LifecycleStage.DELETED:
+                raise ConfigError(
+                    f"the run is deleted in the MLflow store {public_uri(self.uri)}: restore it "
+                    f"(`{self._variable()} mlflow runs restore --run-id {run_id}`), or start a new run"
+                )
             attempts = int(run.data.tags.get("attempts", "1"))
             self._client.update_run(run_id, status="RUNNING")
             self._client.log_batch(run_id, tags=[RunTag("attempts", str(attempts + 1))])
         except MlflowException as error:
             raise ConfigError(
-                f"the MLflow store {public_uri(self.uri)} does not know run {run_id}; name the store it was logged to"
+                f"the MLflow store {public_uri(self.uri)} does not know run {run_id} ({first_line(error)}); put the "
+                "store back that it was logged to, or start a new run"
             ) from error
         self.run_id, self.started_ms = run_id, run.info.start_time
 

@@ -5,6 +5,7 @@ import json
 import shutil
 from pathlib import Path
 
+import mlflow
 import pytest
 import torch
 
@@ -182,6 +183,27 @@ class TestWithARun:
         code, error = run(capsys, "resume", "r", "--runs-dir", str(runs))
         assert code == 2
         assert "--total-env-steps" in error
+
+    def test_runs_go_on_where_they_were_moved(self, capsys, finished, tmp_path):
+        """Copied and moved: the copy's store, artifacts and model are its own; the first ones stay as they are."""
+        copy = Path(shutil.copytree(finished, tmp_path / "copy"))
+        moved = copy.rename(tmp_path / "moved")
+        before = (finished / "mlflow.db").read_bytes()
+        assert run(capsys, "relocate", "--runs-dir", str(moved)) == (0, "")
+        uri = f"sqlite:///{moved / 'mlflow.db'}"
+        mlflow.set_tracking_uri(uri)
+        place = Path(mlflow.artifacts.download_artifacts("models:/sensor-3r-2g@best", dst_path=tmp_path / "model"))
+        mlflow.set_tracking_uri(None)
+        assert (place / "MLmodel").is_file()
+        assert main(["resume", "r", "--runs-dir", str(moved), "--total-env-steps", "6500"]) == 0
+        identity = RunFolder(moved / "r").identity()
+        assert identity.tracking_uri == uri
+        client = mlflow.MlflowClient(uri)
+        assert client.get_run(identity.mlflow_run_id).info.artifact_uri.startswith(str(moved))
+        assert client.get_run(identity.mlflow_run_id).data.params["total_env_steps"] == "6000"
+        assert (finished / "mlflow.db").read_bytes() == before
+        capsys.readouterr()
+        assert run(capsys, "relocate", "--runs-dir", str(moved / "r"))[0] == 2
 
     @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
     def test_a_run_of_another_device_is_resumed_elsewhere(self, capsys, runs):

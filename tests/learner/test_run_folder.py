@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from learner.run_folder import RunFolder, RunIdentity, find_run
+from learner.run_folder import RunFolder, RunIdentity, Storage, find_run
 from sim_core.checks import ConfigError
 
 IDENTITY = RunIdentity("ten robots", "sqlite:///mlflow.db", "shoal", "0123abc")
@@ -24,6 +24,32 @@ def test_a_config_that_an_editor_of_windows_saved_is_read(tmp_path, small_run):
     path = tmp_path / "config.json"
     path.write_text(path.read_text(), "utf-8-sig")
     assert folder.config() == small_run
+
+
+@pytest.mark.parametrize("place", ["runs/checkpoints/one", "runs/one/own", "elsewhere/one"])
+def test_checkpoints_beside_a_run_move_with_it(tmp_path, place):
+    folder = RunFolder(tmp_path / "runs" / "one")
+    folder.save_storage(Storage(str(tmp_path / place), 1))
+    assert folder.checkpoint_location() == tmp_path / place
+    (tmp_path / "runs").rename(tmp_path / "moved")
+    now = tmp_path / place.replace("runs", "moved")
+    assert RunFolder(tmp_path / "moved" / "one").checkpoint_location() == now
+
+
+def test_checkpoints_in_an_object_store_stay_there(tmp_path):
+    folder = RunFolder(tmp_path / "one")
+    folder.save_storage(Storage("memory://bucket/one", 0))
+    assert folder.checkpoint_location() == "memory://bucket/one"
+
+
+def test_what_a_refused_start_leaves_does_not_take_a_name(tmp_path):
+    folder = RunFolder(tmp_path / "one")
+    assert not folder.is_taken()
+    with folder.lock():
+        assert not folder.is_taken()
+    (folder.path / "note.txt").touch()
+    assert folder.is_taken()
+    assert RunFolder(folder.path / "note.txt").is_taken()
 
 
 def test_identity_round_trip(tmp_path):

@@ -14,6 +14,7 @@ from actors.rollout.vector_env import env_shape
 from learner.config import RunConfig, config_hash, flat_params
 from learner.tracking.journal import Row
 from learner.tracking.mlflow_run import Tracker, check_reachable, git_commit
+from learner.tracking.redaction import VARIABLE
 from learner.update.learner import Learner
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
@@ -123,6 +124,37 @@ def test_an_unknown_run_cannot_be_continued(store):
     with pytest.raises(ConfigError, match="does not know run 0123"):
         made.resume("0123456789abcdef0123456789abcdef")
     assert made.run_id == ""
+
+
+def test_a_deleted_experiment_or_run_is_refused_with_how_to_restore_it(store, small_run):
+    client = mlflow.MlflowClient(store[0])
+    tracker = Tracker(store[0], "deleted", store[1])
+    tracker.start(small_run)
+    later = Tracker(store[0], None, None)
+    client.delete_run(tracker.run_id)
+    with pytest.raises(
+        ConfigError, match=f"the run is deleted in .*`{VARIABLE}=.* runs restore --run-id {tracker.run_id}"
+    ):
+        later.resume(tracker.run_id)
+    client.restore_run(tracker.run_id)
+    later.resume(tracker.run_id)
+    client.delete_experiment(tracker._experiment_id)
+    for call in (lambda: Tracker(store[0], "deleted", store[1]), lambda: later.resume(tracker.run_id)):
+        with pytest.raises(
+            ConfigError, match=f"experiment 'deleted' is deleted.*restore -x {tracker._experiment_id}.*--exp"
+        ):
+            call()
+    client.restore_experiment(tracker._experiment_id)
+    later.resume(tracker.run_id)
+
+
+def test_a_resumed_run_makes_no_experiment(tracker, store):
+    client = mlflow.MlflowClient(store[0])
+    client.rename_experiment(tracker._experiment_id, "renamed")
+    later = Tracker(store[0], None, None)
+    later.resume(tracker.run_id)
+    assert later._experiment_id == tracker._experiment_id and client.get_experiment_by_name("tests") is None
+    client.rename_experiment(tracker._experiment_id, "tests")
 
 
 def test_an_experiment_is_made_once(store):
