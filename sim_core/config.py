@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 MAX_HEADINGS = 64
 MAX_HISTORY = 16
+MAX_DELAY_STEPS = 10
 MAX_ROBOTS = 100_000
 """Most robots of one world."""
 LARGEST = 1e6
@@ -166,6 +167,39 @@ class WorldConfig:
     uniform_slow_radius_m: float = 0.25
     """`uniform`: robots slow down within this distance of the goal."""
 
+    position_noise_m: float = 0.0
+    """Standard deviation per axis of a sensed position. This and what follows are the learning robot's alone (ours)."""
+    position_loss: float = 0.0
+    """Probability that the position of another robot is lost in a simulator step."""
+    burst_loss: float = 0.0
+    """Share of the positions of another robot that are lost in bursts (a channel of two states, Gilbert 1960)."""
+    burst_steps: float = 10.0
+    """Mean length of a burst, simulator steps."""
+    position_delay_steps: int = 0
+    """Simulator steps by which positions of other robots are late; the own one is not."""
+    dropped_mates: int = 0
+    """Robots of the own group of which the learning robot senses nothing for the whole episode."""
+    sensing_range_m: float = 0.0
+    """Range of all sensing; 0: no limit."""
+    field_of_view_deg: float = 360.0
+    """Angle of all sensing around the direction of motion, at rest that of the goal."""
+    group_mix_up: float = 0.0
+    """Probability that in a step a robot is taken for one of another group, and that one for it."""
+    command_delay_steps: int = 0
+    """Simulator steps until a velocity command takes effect; the robot rests until the first one does."""
+    speed_error: float = 0.0
+    """Largest error of the driven speed, as a share of it; drawn uniformly in every simulator step."""
+    heading_error_deg: float = 0.0
+    """Largest error of the driven heading; drawn uniformly in every simulator step."""
+    shield: Literal["none", "orca"] = "none"
+    """Whether the learning robot's velocity is projected onto ORCA's half-planes of the robots it senses (ours)."""
+    shield_margin_m: float = 0.02
+    """What the shield keeps free around every robot, beyond robot_radius_m."""
+    shield_horizon_s: float = 0.5
+    """How far ahead the shield avoids collisions."""
+    conditions: Literal["fixed", "drawn"] = "fixed"
+    """position_noise_m to heading_error_deg hold as they are, or each episode draws each between none and its value."""
+
     sources: tuple[tuple[str, str], ...] = ()
     """Path and text of each file that `method` or `scene` names; read when the settings are made, not to be given."""
 
@@ -175,6 +209,7 @@ class WorldConfig:
         _check_counts(self)
         _check_group_sizes(self)
         _check_lengths(self)
+        _check_conditions(self)
         self.scene_class.check(self)
         self.method_class.check(self)
 
@@ -231,7 +266,17 @@ class WorldConfig:
     @property
     def top_speed_m_s(self) -> float:
         """Largest speed of any robot, the learning robot's too."""
-        return max(self.max_speed_m_s, self.method_class.top_speed_m_s(self))
+        return max(self.max_speed_m_s, self.method_class.top_speed_m_s(self) * (1 + self.speed_error))
+
+    @property
+    def senses_badly(self) -> bool:
+        """Whether the learning robot senses other robots otherwise than they are."""
+        return any(getattr(self, name) != UNIMPAIRED[name] for name in SENSE_CONDITIONS)
+
+    @property
+    def drives_badly(self) -> bool:
+        """Whether the learning robot moves otherwise than its commands say."""
+        return any(getattr(self, name) != UNIMPAIRED[name] for name in COMMAND_CONDITIONS)
 
     @property
     def setup(self) -> str:
@@ -305,11 +350,20 @@ POSITIVE = (
     "robot_radius_m max_speed_m_s orca_radius_m orca_horizon_s neighbour_range_m separation_range_m sight_range_m "
     "view_range_m uniform_separation_range_m uniform_view_corridor_m uniform_slow_radius_m ellipse_chi_square "
     "ellipse_smallest_half_axis_m ellipse_scale_per_m goal_scale_per_m apf_range_m apf_limit_m_s "
-    "learner_speed_limit_m_s"
+    "learner_speed_limit_m_s shield_horizon_s"
 ).split()
 NON_NEGATIVE = (
-    "start_jitter_m separation_noise cohesion_weight separation_weight alignment_weight apf_gain_m4_s"
+    "start_jitter_m separation_noise cohesion_weight separation_weight alignment_weight apf_gain_m4_s "
+    "position_noise_m shield_margin_m"
 ).split()
+SHARES = "position_loss group_mix_up speed_error".split()
+SENSE_CONDITIONS = (
+    "position_noise_m position_loss burst_loss position_delay_steps dropped_mates sensing_range_m field_of_view_deg "
+    "group_mix_up"
+).split()
+COMMAND_CONDITIONS = "command_delay_steps speed_error heading_error_deg".split()
+UNIMPAIRED: dict[str, float] = dict.fromkeys(SENSE_CONDITIONS + COMMAND_CONDITIONS, 0) | {"field_of_view_deg": 360.0}
+"""Every condition of sensing and driving, with its value where there is none."""
 ANGLES = "separation_angle_deg sight_angle_deg view_angle_deg".split()
 
 
@@ -348,4 +402,44 @@ def _check_lengths(config: WorldConfig) -> None:
         step_m <= 2 * config.robot_radius_m,
         f"time_step_s ({config.time_step_s}) lets a robot jump {step_m:.3g} m in a step, past another robot: "
         f"keep time_step_s × speed at most 2 × robot_radius_m ({2 * config.robot_radius_m:.3g} m)",
+    )
+
+
+def _check_conditions(config: WorldConfig) -> None:
+    for name in SHARES:
+        require(0 <= getattr(config, name) <= 1, f"{name} must be between 0 and 1, not {getattr(config, name)}")
+    for name in ("position_delay_steps", "command_delay_steps"):
+        delay = getattr(config, name)
+        require(0 <= delay <= MAX_DELAY_STEPS, f"{name} must be between 0 and {MAX_DELAY_STEPS}, not {delay}")
+    require(
+        1 <= config.burst_steps <= LARGEST, f"burst_steps must be between 1 and {LARGEST:.0e}, not {config.burst_steps}"
+    )
+    most = config.burst_steps / (1 + config.burst_steps)
+    require(
+        0 <= config.burst_loss <= most,
+        f"burst_loss must be between 0 and {most:.3g}, which bursts of burst_steps ({config.burst_steps}) can reach, "
+        f"not {config.burst_loss}",
+    )
+    mates = min(config.group_sizes) - 1
+    require(
+        0 <= config.dropped_mates <= mates,
+        f"dropped_mates must be between 0 and {mates}, the other robots of the learning robot's group, not "
+        f"{config.dropped_mates}",
+    )
+    contact_m = 2 * config.robot_radius_m
+    require(
+        config.sensing_range_m == 0 or contact_m <= config.sensing_range_m <= LARGEST,
+        f"sensing_range_m must be 0 (no limit) or between 2 × robot_radius_m ({contact_m:.3g} m), where robots touch, "
+        f"and {LARGEST:.0e}, not {config.sensing_range_m}",
+    )
+    require(
+        0 < config.field_of_view_deg <= 360, f"field_of_view_deg must be in (0, 360], not {config.field_of_view_deg}"
+    )
+    require(
+        0 <= config.heading_error_deg <= 180, f"heading_error_deg must be in [0, 180], not {config.heading_error_deg}"
+    )
+    require(
+        config.shield_horizon_s >= config.time_step_s,
+        f"shield_horizon_s ({config.shield_horizon_s}) must be at least time_step_s ({config.time_step_s}), or robots "
+        "collide within the step that the shield looks ahead",
     )

@@ -38,10 +38,23 @@ class ORCAParams(NamedTuple):
     inverse_horizon_1_s: Any
     inverse_time_step_1_s: Any
     max_speed_m_s: Any
+    responsibility: Any
 
 
-def orca_params(radius_m: float, horizon_s: float, time_step_s: float, max_speed_m_s: float, dtype: Any) -> ORCAParams:
-    """The constants for robots of one radius, each a scalar of `dtype`."""
+def orca_params(
+    radius_m: float,
+    horizon_s: float,
+    time_step_s: float,
+    max_speed_m_s: float,
+    dtype: Any,
+    *,
+    responsibility: float = 0.5,
+) -> ORCAParams:
+    """The constants for robots of one radius, each a scalar of `dtype`.
+
+    `responsibility` is the share of the avoidance that a robot takes: half of it where both robots of a pair avoid
+    each other, all of it where the other one does not.
+    """
     real = np.dtype(dtype).type
     return ORCAParams(
         half=real(0.5),
@@ -52,6 +65,7 @@ def orca_params(radius_m: float, horizon_s: float, time_step_s: float, max_speed
         inverse_horizon_1_s=real(1) / real(horizon_s),
         inverse_time_step_1_s=real(1) / real(time_step_s),
         max_speed_m_s=real(max_speed_m_s),
+        responsibility=real(responsibility),
     )
 
 
@@ -65,8 +79,9 @@ def half_plane(rel_x, rel_y, rel_vx, rel_vy, vx, vy, tie_sign, p):
     apex; its radius is the combined radius / tau, its centre is the relative position / tau.
 
     The vector u leads from the relative velocity to the nearest point of the obstacle's boundary. Each robot of a pair
-    takes half of it: the line passes through the robot's velocity + u / 2, parallel to the boundary's tangent at that
-    point. The optimisation velocities are the current velocities (Section 5.2). The cases are:
+    takes half of it (`p.responsibility`): the line passes through the robot's velocity + u / 2, parallel to the
+    boundary's tangent at that point. The optimisation velocities are the current velocities (Section 5.2). The cases
+    are:
 
     * No collision: project on the cut-off circle, on the left leg, or on the right leg.
     * Collision, i.e. the discs overlap: project on the cut-off circle of the time step, so that they part in one step.
@@ -116,7 +131,7 @@ def half_plane(rel_x, rel_y, rel_vx, rel_vy, vx, vy, tie_sign, p):
     u_x = select(on_circle, u_length * unit_x, along_leg * leg_x - rel_vx)
     u_y = select(on_circle, u_length * unit_y, along_leg * leg_y - rel_vy)
     dir_x, dir_y = select(on_circle, unit_y, leg_x), select(on_circle, -unit_x, leg_y)
-    return vx + p.half * u_x, vy + p.half * u_y, dir_x, dir_y
+    return vx + p.responsibility * u_x, vy + p.responsibility * u_y, dir_x, dir_y
 
 
 @inlined

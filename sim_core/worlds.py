@@ -17,11 +17,15 @@ from sim_core.outcomes import Outcome
 from sim_core.packed import packed
 from sim_core.rng import world_streams
 from sim_core.scenes import make_scene
+from sim_core.senses import Senses
+from sim_core.shield import Shield
 from sim_core.state import CONSTANT, WorldState, empty_state
 from sim_core.swarm.step import advance, reset_episode, swarm_params
 from sim_core.swarm.tile import world_tile
 
 _RUNNING = int(Outcome.RUNNING)
+FAR_M = 1e3
+"""Where FL-ORCA in the learning robot's place puts robots that it does not sense: far from all others."""
 
 
 @kernel
@@ -68,7 +72,10 @@ class WorldBatch:
       num_worlds: size of the batch.
 
     Attributes:
+      state: the worlds as they are.
+      sensed: the worlds as the learning robots sense them; `state` itself unless the settings impair senses.
       step_reward: `[num_worlds]` float32, reward of the last simulator step.
+      asked: `[2, num_worlds]` float32, m/s: the velocity of the last step before shield and errors of driving.
     """
 
     def __init__(self, config: WorldConfig, num_worlds: int) -> None:
@@ -79,8 +86,13 @@ class WorldBatch:
         self.tile = world_tile(config, num_worlds, np.float32)
         self.swarm = packed(swarm_params(config, np.float32))
         self.scene = make_scene(config)
-        self._command_x = np.zeros(num_worlds, np.float32)
-        self._command_y = np.zeros(num_worlds, np.float32)
+        impaired = config.senses_badly or config.drives_badly
+        self._senses = Senses(config, self.state) if impaired else None
+        self._shield = Shield(config) if config.shield == "orca" else None
+        self.sensed: WorldState = self.state if self._senses is None else self._senses.sensed
+        self.asked = np.zeros((2, num_worlds), np.float32)
+        self._command = np.zeros((2, num_worlds), np.float32)
+        self._command_x, self._command_y = self._command
         self._observation = np.zeros((num_worlds, *self.method.observation_shape), self.method.observation_dtype)
         self._history = np.zeros((num_worlds, config.history, *self.method.observation_shape), self._observation.dtype)
         self._reward = np.zeros(num_worlds, np.float32)
@@ -111,7 +123,9 @@ class WorldBatch:
         mask = self._all if mask is None else mask
         self.scene.start(self.state, mask)
         reset_episode(self.state, mask)
-        self.method.perceive(self.state, mask, self._observation)
+        if self._senses is not None:
+            self._senses.begin(mask)
+        self.method.perceive(self.sensed, mask, self._observation)
         if self.config.history > 1:
             self._history[mask] = self._observation[mask, None]
         return self.observation()
@@ -163,33 +177,58 @@ class WorldBatch:
         )
 
     def _perceive(self) -> None:
-        self.method.perceive(self.state, self._all, self._observation)
+        self.method.perceive(self.sensed, self._all, self._observation)
         if self.config.history > 1:
             self._history[:, 1:] = self._history[:, :-1].copy()
             self._history[:, 0] = self._observation
 
     def _simulate(self, action: NDArray[np.int64] | Pilot) -> bool:
         """Moves the running worlds by one simulator step and adds its rewards; returns whether any still runs."""
-        state, running, command = self.state, self._running, (self._command_x, self._command_y)
-        if isinstance(action, Pilot):
-            advance(state, self.tile, running, *command, False, self.swarm)
-        else:
-            self.method.velocity(state, action, *command)
-            advance(state, self.tile, running, *command, True, self.swarm)
+        state, running = self.state, self._running
+        is_given = self._give_command(action)
+        advance(state, self.tile, running, self._command_x, self._command_y, is_given, self.swarm)
         self.method.outcome(state, running, self._outcome)
         self.method.reward(state, running, self._outcome, self.step_reward)
+        if self._senses is not None:
+            self._senses.sense(running)
         return bool(_end_step(running, self._outcome, self.step_reward, self._reward))
+
+    def _give_command(self, action: NDArray[np.int64] | Pilot) -> bool:
+        """Writes the velocities that the learning robots drive; returns False where FL-ORCA drives as it is."""
+        command = self._command
+        if self._senses is None and self._shield is None:
+            if isinstance(action, Pilot):
+                return False
+            self.method.velocity(self.state, action, self._command_x, self._command_y)
+            return True
+        if isinstance(action, Pilot):
+            command[:] = self._swarm_velocity()
+        else:
+            self.method.velocity(self.sensed, action, self._command_x, self._command_y)
+        self.asked[:] = command
+        if self._shield is not None:
+            self._shield.project(self.sensed, self._running, self._command_x, self._command_y)
+        if self._senses is not None:
+            self._senses.drive(self._running, self._command_x, self._command_y)
+        return True
+
+    def _swarm_velocity(self) -> NDArray[np.float32]:
+        """The velocities `[2, num_worlds]` (m/s) that FL-ORCA has for the learning robots by what they sense."""
+        state = WorldState(*(array.copy() for array in self.sensed))
+        world, unknown = np.arange(self.num_worlds), np.isnan(state.pos_x)
+        for position in (state.pos_x, state.pos_y):
+            np.copyto(position, position[world, state.learner][:, None] + np.float32(FAR_M), where=unknown)
+        state.vel_x[unknown] = state.vel_y[unknown] = 0.0
+        advance(state, self.tile, self._all, self._command_x, self._command_y, False, self.swarm)
+        return np.stack([state.vel_x[world, state.learner], state.vel_y[world, state.learner]])
 
     def actions_nearest_to_swarm(self) -> NDArray[np.int64]:
         """The actions `[num_worlds]` whose velocities are nearest to those that FL-ORCA has for the learning robots."""
-        state = WorldState(*(array.copy() for array in self.state))
-        advance(state, self.tile, self._all, self._command_x, self._command_y, False, self.swarm)
-        world = np.arange(self.num_worlds)
-        wanted = np.stack([state.vel_x[world, state.learner], state.vel_y[world, state.learner]])
+        wanted = self._swarm_velocity()
         distance_sq = np.empty((self.config.num_actions, self.num_worlds))
         velocity = np.empty((2, self.num_worlds), np.float32)
         for action in range(self.config.num_actions):
-            self.method.velocity(self.state, np.full(self.num_worlds, action), velocity[0], velocity[1])
+            self.method.velocity(self.sensed, np.full(self.num_worlds, action), velocity[0], velocity[1])
             distance_sq[action] = np.square(velocity - wanted).sum(axis=0)
         return np.asarray(distance_sq.argmin(axis=0), np.int64)
 
@@ -201,6 +240,10 @@ class WorldBatch:
         """Positions `[num_worlds, num_robots, 2]`, metres."""
         return np.stack([self.state.pos_x, self.state.pos_y], axis=-1)
 
+    def sensed_positions(self) -> NDArray[np.float32]:
+        """Positions as the learning robots sense them `[num_worlds, num_robots, 2]`, metres; NaN where not."""
+        return np.stack([self.sensed.pos_x, self.sensed.pos_y], axis=-1)
+
     def goals(self) -> NDArray[np.float32]:
         """Goals `[num_worlds, groups, 2]`, metres."""
         return np.stack([self.state.goal_x, self.state.goal_y], axis=-1)
@@ -208,6 +251,7 @@ class WorldBatch:
     def _changing(self) -> dict[str, NDArray[Any]]:
         """The arrays that steps change."""
         changing = {name: array for name, array in self.state._asdict().items() if name not in CONSTANT}
+        changing |= {} if self._senses is None else self._senses.arrays()
         return changing | ({"history": self._history} if self.config.history > 1 else {})
 
     def get_state(self) -> dict[str, NDArray[Any]]:
@@ -227,7 +271,7 @@ class WorldBatch:
                 raise ValueError(f"saved worlds do not fit: {name} should be {array.dtype}{array.shape}")
         for name, array in arrays.items():
             array[...] = saved[name]
-        self.method.perceive(self.state, self._all, self._observation)
+        self.method.perceive(self.sensed, self._all, self._observation)
         return self.observation()
 
 

@@ -27,8 +27,10 @@ class Compass(Method):
         learner = state.learner[:, None]
         dx = state.pos_x - np.take_along_axis(state.pos_x, learner, axis=1)  # [num_worlds, num_robots]
         dy = state.pos_y - np.take_along_axis(state.pos_y, learner, axis=1)
-        own = state.group == state.group[learner]
-        near = np.where(own, np.inf, dx * dx + dy * dy).argmin(axis=1)[:, None]
+        own, known = state.group == state.group[learner], np.isfinite(dx)  # a robot that is not sensed is at NaN
+        dx, dy = np.where(known, dx, 0.0), np.where(known, dy, 0.0)
+        near = np.where(own | ~known, np.inf, dx * dx + dy * dy).argmin(axis=1)[:, None]
+        own &= known
         x = [np.mean(dx, axis=1, where=own), np.take_along_axis(dx, near, axis=1)[:, 0]]
         y = [np.mean(dy, axis=1, where=own), np.take_along_axis(dy, near, axis=1)[:, 0]]
         limit = self.config.outer_radius_m

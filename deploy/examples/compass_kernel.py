@@ -13,15 +13,17 @@ def perceive(state, mask, out):
         if not mask[world]:
             continue
         learner, (_, begin, end) = state.learner[world], own_group(state, world)
-        pos_x, pos_y, nearest_sq = state.pos_x[world], state.pos_y[world], np.inf
+        pos_x, pos_y, nearest_sq, known = state.pos_x[world], state.pos_y[world], np.inf, 0
         out[world, :] = 0.0
         for robot in range(pos_x.shape[0]):
             dx, dy = pos_x[robot] - pos_x[learner], pos_y[robot] - pos_y[learner]
+            if not np.isfinite(dx):  # a robot that is not sensed
+                continue
             if begin <= robot < end:
-                out[world, 0] += dx / (end - begin)
-                out[world, 1] += dy / (end - begin)
+                out[world, 0], out[world, 1], known = out[world, 0] + dx, out[world, 1] + dy, known + 1
             elif dx * dx + dy * dy < nearest_sq:
                 nearest_sq, out[world, 2], out[world, 3] = dx * dx + dy * dy, dx, dy
+        out[world, 0], out[world, 1] = out[world, 0] / known, out[world, 1] / known
 
 
 class FastCompass(Method):

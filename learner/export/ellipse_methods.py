@@ -1,7 +1,7 @@
 """M_IN's and M_OUT's decisions as torch modules (see `robot_module`).
 
 Where a group is given of which the robot knows no robot, there is no ellipse and so no decision: the action is
-NO_DECISION and the velocity zero.
+NO_DECISION and the velocity zero. A policy that has learned with bad senses decides there, too, on zeros.
 """
 
 from __future__ import annotations
@@ -72,7 +72,6 @@ class EllipseRobot(RobotModule):
 
     counted: Tensor
     places: Tensor
-    undecided = "; -1 and no velocity where a group has no robot"
 
     def __init__(self, network: Network, config: WorldConfig) -> None:
         super().__init__(network, config)
@@ -80,6 +79,7 @@ class EllipseRobot(RobotModule):
         self.ellipse = ellipse_params(config)
         self.field = RepulsiveField(config)
         self.limit = observation_limit(config)
+        self.decides_always = config.senses_badly
         method = config.method_class
         self.absent = len(method.observation_names(config)) - config.groups * method.row_size
         counted = torch.zeros(config.groups, dtype=torch.float64)
@@ -94,7 +94,8 @@ class EllipseRobot(RobotModule):
         order = "in any order" if config.group_order == "nearest" else around
         groups = f"group 0 is the own one, without the robot itself; the others {order}"
         meaning = f"relative positions of all robots of every group: {groups}"
-        unused = "False where a place is not used; its position then does not count; every group needs one robot"
+        unused = "False where a place is not used; its position then does not count"
+        unused += "" if config.senses_badly else "; every group needs one robot"
         return [
             Port("positions", "float32", ("batch", config.groups, "robots", 2), "m", meaning),
             Port("mask", "bool", ("batch", config.groups, "robots"), "", unused),
@@ -110,6 +111,11 @@ class EllipseRobot(RobotModule):
             f"lengths of ellipses × {config.ellipse_scale_per_m} per m, goals × {config.goal_scale_per_m} per m, theta "
             "in rad"
         )
+
+    @classmethod
+    def undecided(cls, config: WorldConfig) -> str:
+        """There is no decision without an ellipse of every group."""
+        return "" if config.senses_badly else "; -1 and no velocity where a group has no robot"
 
     @classmethod
     def sense(cls, worlds: WorldBatch) -> dict[str, NDArray[Any]]:
@@ -135,7 +141,8 @@ class EllipseRobot(RobotModule):
         root = (half * half + shared * shared).sqrt()
         axes = [self.ellipse.axis_scale * value.clamp(min=0.0).sqrt() for value in (mean - root, mean + root)]
         a, b = (axis.clamp(min=self.ellipse.smallest_m) for axis in axes)
-        return torch.stack([a, b, centre[..., 0], centre[..., 1], self._angle(shared, half)], dim=-1)
+        ellipse = torch.stack([a, b, centre[..., 0], centre[..., 1], self._angle(shared, half)], dim=-1)
+        return torch.where(count.unsqueeze(-1) > 0.0, ellipse, 0.0)
 
     def _angle(self, shared: Tensor, half: Tensor) -> Tensor:
         """Angle from the x-axis to the longer half-axis, in (-pi/2, pi/2]."""
@@ -158,8 +165,8 @@ class EllipseRobot(RobotModule):
 
     def _nearest_first(self, matrix: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
         """Rows with the other groups by the distance of their centres, equal ones in the order of the input."""
-        centre, _ = self._centres(positions.double(), mask)
-        distance_sq = (centre * centre).sum(-1)
+        centre, count = self._centres(positions.double(), mask)
+        distance_sq = torch.where(count > 0.0, (centre * centre).sum(-1), math.inf)
         distance_sq = torch.where(self.places == 0, -1.0, distance_sq)  # the own group stays first
         here, there = distance_sq.unsqueeze(2), distance_sq.unsqueeze(1)
         earlier = self.places.unsqueeze(0) < self.places.unsqueeze(1)
@@ -194,7 +201,7 @@ class EllipseRobot(RobotModule):
             matrix = self._nearest_first(matrix, positions, mask)
         observation = functional.pad(matrix.flatten(1), (0, self.absent))
         values = self.network(observation)
-        known = mask.any(2).all(1)
+        known = torch.ones_like(mask[:, 0, :1]).any(1) if self.decides_always else mask.any(2).all(1)
         action = values.argmax(1)
         if held is not None:
             action = torch.where(held >= 0, held, action)

@@ -65,7 +65,7 @@ def swarm_states(config: WorldConfig, driver: Candidate, weights: WeightsSnapsho
 def _decided(worlds: WorldBatch, policy: Policy, observation: NDArray[Any]) -> dict[str, NDArray[Any]]:
     values, action = policy.values(observation), policy.greedy(observation)
     velocity = np.zeros((2, worlds.num_worlds), np.float32)
-    worlds.method.velocity(worlds.state, action, velocity[0], velocity[1])
+    worlds.method.velocity(worlds.sensed, action, velocity[0], velocity[1])
     seen = observation.astype(np.float32)
     return {"velocity": velocity.T, "action": action, "action_values": values, "observation": seen}
 

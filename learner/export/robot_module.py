@@ -55,8 +55,6 @@ class RobotModule(nn.Module):
     """
 
     headings: Tensor
-    undecided = ""
-    """Said of an action where the state cannot be formed."""
 
     def __init__(self, network: Network, config: WorldConfig) -> None:
         super().__init__()
@@ -74,6 +72,11 @@ class RobotModule(nn.Module):
         raise NotImplementedError
 
     @classmethod
+    def undecided(cls, config: WorldConfig) -> str:
+        """What to say of an action where the state cannot be formed."""
+        return ""
+
+    @classmethod
     def sense(cls, worlds: WorldBatch) -> dict[str, NDArray[Any]]:
         """What the learning robots of a batch of worlds sense, as the module's inputs by name."""
         raise NotImplementedError
@@ -84,7 +87,7 @@ class RobotModule(nn.Module):
         size = len(config.method_class.observation_names(config))
         speed = config.method_class.top_speed_m_s(config)
         stop = ", the last one stops" if config.stop_action else ""
-        heading = f"sector to head for, from angle -pi on{stop}{cls.undecided}"
+        heading = f"sector to head for, from angle -pi on{stop}{cls.undecided(config)}"
         values = "discounted reward promised by each action"
         return [
             Port(
@@ -123,20 +126,21 @@ def make_robot(network: Network, config: WorldConfig) -> RobotModule:
 
 
 def relative_positions(worlds: WorldBatch) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
-    """Positions and goals relative to the learning robots, the own group first and the robot itself masked.
+    """What the robots sense, relative to them, the own group first; the robot itself and robots not sensed are masked.
 
     Returns:
       Positions `[num_worlds, groups, largest group, 2]`, their mask `[num_worlds, groups, largest group]` and goals
       `[num_worlds, groups, 2]`; metres.
     """
-    config, state = worlds.config, worlds.state
+    config, state = worlds.config, worlds.sensed
     rows, sizes = np.arange(worlds.num_worlds), np.array(config.group_sizes)
     robot = state.group_begin[:-1, None] + np.arange(sizes.max())
     there = np.arange(sizes.max()) < sizes[:, None]
-    positions = worlds.positions()
+    positions = worlds.sensed_positions()
     itself = positions[rows, state.learner]
     relative = (positions - itself[:, None])[:, np.where(there, robot, 0)]
-    mask = there & (robot != state.learner[:, None, None])
+    mask = there & (robot != state.learner[:, None, None]) & np.isfinite(relative[..., 0])
+    relative[~mask] = 0.0
     order = (state.group[state.learner][:, None] + np.arange(config.groups)) % config.groups
     arrays = (relative, mask, worlds.goals() - itself[:, None])
     own_first = [

@@ -44,7 +44,7 @@ def limited(x, y, limit):
 def repulsion(dx, dy, p):
     """Velocity (m/s) away from a robot that is (dx, dy) metres off. `p`: FieldParams."""
     distance = math.sqrt(dx * dx + dy * dy)
-    if distance >= p.range_m or distance < NEAREST_M:
+    if not NEAREST_M <= distance < p.range_m:  # nor where it is NaN: not sensed
         return 0.0, 0.0
     speed = p.gain * (1.0 / distance - 1.0 / p.range_m) / (distance * distance)
     speed = min(speed, p.limit_m_s)

@@ -188,11 +188,14 @@ class Method:
         return {}
 
     def observe(self, state: WorldState) -> NDArray[Any]:
-        """Observations `[num_worlds, size]` of all worlds, in plain numpy; a method with kernels defines `perceive`."""
+        """Observations `[num_worlds, size]` of all worlds, in plain numpy; a method with kernels defines `perceive`.
+
+        `state` is what the learning robots sense (`sim_core.senses`): a robot that is not sensed is at NaN.
+        """
         raise NotImplementedError(f"{type(self).__name__} must define observe(self, state)")
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[Any]) -> None:
-        """Writes observations `[num_worlds, *observation_shape]` of the worlds where `mask` is set."""
+        """Writes observations `[num_worlds, *observation_shape]` of the worlds where `mask` is set; see `observe`."""
         seen = np.asarray(self.observe(state))
         if seen.shape != out.shape:
             raise ValueError(f"observations of shape {seen.shape}, not {out.shape}")
@@ -208,6 +211,8 @@ class Method:
 
     def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
         """Writes the learning robots' velocities `[num_worlds]` (m/s) for `action` `[num_worlds]`: u_nn of Eq. 3.4.
+
+        `state` is what the learning robots sense.
 
         Raises:
           ValueError: there is not one action a world, or one is none of the actions.
@@ -267,7 +272,8 @@ class CheckedMethod(Method):
         with guarded(self._cls, doing):
             self._method.perceive(state, mask, out)
         if self._is_float and not np.isfinite(out).all():
-            raise refuse(self._cls, doing, "gave an observation that is not finite")
+            hint = "; robots that the learning robot does not sense are at NaN" if self.config.senses_badly else ""
+            raise refuse(self._cls, doing, f"gave an observation that is not finite{hint}")
         if np.abs(out).max(initial=0) > self.observation_limit:
             raise refuse(self._cls, doing, f"gave an observation beyond observation_limit = {self.observation_limit}")
 

@@ -47,10 +47,13 @@ def ellipse_params(config: WorldConfig) -> EllipseParams:
 
 @kernel
 def group_centre(begin, end, pos_x, pos_y, left_out):
-    """(x_c, y_c, n): mean position of robots begin..end-1 but `left_out`, metres, and their number (Eq. 4.5, 4.6)."""
+    """(x_c, y_c, n): mean position of robots begin..end-1 but `left_out`, metres, and their number (Eq. 4.5, 4.6).
+
+    Robots at NaN, which are not sensed, do not count; the mean of none is NaN.
+    """
     x, y, count = 0.0, 0.0, 0
     for i in range(begin, end):
-        if i != left_out:
+        if i != left_out and pos_x[i] == pos_x[i]:
             x, y, count = x + pos_x[i], y + pos_y[i], count + 1
     return x / count, y / count, count
 
@@ -61,7 +64,7 @@ def group_covariance(begin, end, pos_x, pos_y, left_out):
     x_c, y_c, count = group_centre(begin, end, pos_x, pos_y, left_out)
     xx, xy, yy = 0.0, 0.0, 0.0
     for i in range(begin, end):
-        if i != left_out:
+        if i != left_out and pos_x[i] == pos_x[i]:
             dx, dy = pos_x[i] - x_c, pos_y[i] - y_c
             xx, xy, yy = xx + dx * dx, xy + dx * dy, yy + dy * dy
     freedom = max(count - 1, 1)

@@ -78,7 +78,7 @@ def _order_groups(world, state, order, distance_sq, p):
         if p.nearest_first:
             x, y, _ = group_centre(state.group_begin[group], state.group_begin[group + 1], pos_x, pos_y, NOBODY)
             dx, dy = x - pos_x[learner], y - pos_y[learner]
-            near = dx * dx + dy * dy
+            near = dx * dx + dy * dy if x == x else np.inf  # a group that is not sensed is the last one
             while at > 1 and distance_sq[at - 1] > near:
                 order[at], distance_sq[at] = order[at - 1], distance_sq[at - 1]
                 at -= 1
@@ -92,6 +92,8 @@ def _write_row(group, world, state, out, at, p):
     pos_x, pos_y, learner = state.pos_x[world], state.pos_y[world], state.learner[world]
     begin, end = state.group_begin[group], state.group_begin[group + 1]
     a, b, x_c, y_c, theta = group_ellipse(begin, end, pos_x, pos_y, left_out_of(learner, p.ellipse), p.ellipse)
+    if x_c != x_c:  # none of its robots is sensed: no ellipse, which no half-axis of 0 can be taken for
+        a, b, x_c, y_c, theta = 0.0, 0.0, pos_x[learner] + 0.0, pos_y[learner] + 0.0, 0.0
     out[at], out[at + 1] = a * p.ellipse_scale, b * p.ellipse_scale
     out[at + 2] = (x_c - pos_x[learner]) * p.ellipse_scale
     out[at + 3] = (y_c - pos_y[learner]) * p.ellipse_scale

@@ -106,7 +106,7 @@ def _perceive(state, mask, out, edges, params):
         for other in range(pos_x.shape[0]):
             dx, dy = pos_x[other] - pos_x[learner], pos_y[other] - pos_y[learner]
             dist_sq = dx * dx + dy * dy
-            if other == learner or dist_sq >= p.outer_sq:
+            if other == learner or not dist_sq < p.outer_sq:  # not sensed: NaN
                 continue
             if p.faces_goal:
                 dx, dy = cos * dx + sin * dy, cos * dy - sin * dx

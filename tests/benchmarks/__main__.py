@@ -22,6 +22,7 @@ BENCHMARKS = (
     "export",
     "checkpoints",
     "user_methods",
+    "senses",
 )
 
 

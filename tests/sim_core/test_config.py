@@ -7,13 +7,30 @@ import math
 import pytest
 
 from sim_core.checks import ConfigError
-from sim_core.config import ANGLES, LARGEST, LARGEST_REWARD, MAX_HEADINGS, NON_NEGATIVE, POSITIVE, WorldConfig
+from sim_core.config import (
+    ANGLES,
+    LARGEST,
+    LARGEST_REWARD,
+    MAX_DELAY_STEPS,
+    MAX_HEADINGS,
+    NON_NEGATIVE,
+    POSITIVE,
+    SHARES,
+    WorldConfig,
+)
 from sim_core.scenes.circle import start_grid_radius_m
 
 DEFAULTS = {field.name: field.default for field in dataclasses.fields(WorldConfig)}
 WHOLE = [name for name, value in DEFAULTS.items() if type(value) is int]
 REALS = [name for name, value in DEFAULTS.items() if type(value) is float]
 FLAGS = [name for name, value in DEFAULTS.items() if type(value) is bool]
+OTHER_BOUNDS = {  # values that are accepted, and values that are refused
+    "burst_loss": ((0.0, 0.5, 10 / 11), (-0.1, 0.92, 1.0, 2.0)),  # a burst of 10 steps, then one step without
+    "burst_steps": ((1.0, 500.0), (0.99, 0.0, -1.0, 1e7)),
+    "sensing_range_m": ((0.0, 0.2, 100.0), (0.19, -1.0, 1e7)),
+    "field_of_view_deg": ((0.1, 360.0), (0.0, -90.0, 360.1)),
+    "heading_error_deg": ((0.0, 180.0), (-0.1, 180.1)),
+}
 NAMES = [name for name, value in DEFAULTS.items() if type(value) is str]
 
 
@@ -41,7 +58,7 @@ def test_table_3_2_is_the_default():
 
 def test_fields_are_of_four_kinds_and_every_real_one_has_a_bound():
     assert len(WHOLE) + len(REALS) + len(FLAGS) + len(NAMES) + len(["sources"]) == len(DEFAULTS)
-    assert sorted(POSITIVE + NON_NEGATIVE + ANGLES) == sorted(REALS)
+    assert sorted(POSITIVE + NON_NEGATIVE + ANGLES + SHARES + list(OTHER_BOUNDS)) == sorted(REALS)
 
 
 @pytest.mark.parametrize("name", REALS)
@@ -87,6 +104,35 @@ def test_angles(name):
     WorldConfig(**{name: 180.0})
 
 
+@pytest.mark.parametrize("name", SHARES)
+def test_shares(name):
+    for value in (-0.01, 1.01, 2.0):
+        refuses(name, **{name: value})
+    for value in (0.0, 1.0):
+        WorldConfig(**{name: value})
+
+
+@pytest.mark.parametrize("name", OTHER_BOUNDS)
+def test_other_bounds(name):
+    accepted, refused = OTHER_BOUNDS[name]
+    for value in refused:
+        refuses(name, **{name: value})
+    for value in accepted:
+        assert getattr(WorldConfig(**{name: value}), name) == value
+
+
+def test_conditions_that_make_nothing_worse_are_none():
+    assert not WorldConfig().senses_badly and not WorldConfig().drives_badly
+    assert not WorldConfig(burst_steps=3.0, shield="orca", conditions="drawn").senses_badly
+    assert WorldConfig(field_of_view_deg=359.0).senses_badly and WorldConfig(dropped_mates=1).senses_badly
+    assert WorldConfig(command_delay_steps=1).drives_badly and not WorldConfig(speed_error=0.1).senses_badly
+
+
+def test_a_speed_error_counts_for_the_distance_of_a_step():
+    refuses("time_step_s", learner_speed_m_s=3.0, speed_error=0.5)
+    assert WorldConfig(learner_speed_m_s=2.0, speed_error=0.5).top_speed_m_s == 3.0
+
+
 @pytest.mark.parametrize(
     ("name", "below", "lowest", "highest", "above"),
     [
@@ -96,6 +142,9 @@ def test_angles(name):
         ("horizon_steps", 0, 1, None, None),
         ("max_neighbours", 0, 1, 64, 65),
         ("outside_limit_steps", 0, 1, None, None),
+        ("position_delay_steps", -1, 0, MAX_DELAY_STEPS, MAX_DELAY_STEPS + 1),
+        ("command_delay_steps", -1, 0, MAX_DELAY_STEPS, MAX_DELAY_STEPS + 1),
+        ("dropped_mates", -1, 0, 9, 10),  # of 10 robots a group one is the learning robot
     ],
 )
 def test_counts(name, below, lowest, highest, above):
@@ -201,6 +250,7 @@ def test_a_number_that_float32_cannot_square_is_refused(name):
     [
         ("orca_horizon_s", {"orca_horizon_s": 0.01}),
         ("orca_horizon_s", {"orca_horizon_s": 0.15, "time_step_s": 0.16}),
+        ("shield_horizon_s", {"shield_horizon_s": 0.01}),
         ("neighbour_range_m", {"neighbour_range_m": 0.4}),
         ("neighbour_range_m", {"orca_radius_m": 0.8}),
     ],

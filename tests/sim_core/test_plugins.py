@@ -64,11 +64,19 @@ def place(self, uniform):
 
 
 def test_the_kernel_sees_what_numpy_sees():
-    for settings in ({"robots": 7, "groups": 3}, {"scene": CORRIDOR}):
+    lost = {"position_loss": 0.3, "dropped_mates": 2}
+    for settings in ({"robots": 7, "groups": 3}, {"scene": CORRIDOR}, {"robots": 7, "groups": 3, **lost}):
         plain, rewards = played(WorldConfig(method=COMPASS, **settings))
         fast, same_rewards = played(WorldConfig(method=FAST_COMPASS, **settings))
         np.testing.assert_allclose(plain, fast, atol=1e-5)
         np.testing.assert_array_equal(rewards, same_rewards)
+
+
+def test_a_method_that_forgets_robots_that_are_not_sensed_is_told_so(tmp_path):
+    name = written(tmp_path, METHOD)
+    rehearse(WorldConfig(method=name))
+    with pytest.raises(PluginError, match=r"mine.py, line \d+: observe of Mine .*not finite; robots .* are at NaN"):
+        rehearse(WorldConfig(method=name, position_loss=0.5))
 
 
 def test_a_compass_points_to_where_the_positions_say():

@@ -29,6 +29,13 @@ WORLDS = {
         method="in", robots=6, groups=4, ellipse_covariance="full", group_order="nearest", apf_range_m=1.5
     ),
     "in, rows for more groups": WorldConfig(method="in", robots=5, groups=3, group_rows=7),
+    "sensor, bad senses": WorldConfig(robots=6, groups=3, position_loss=0.5, position_noise_m=0.1, dropped_mates=1),
+    "in, bad senses, nearest": WorldConfig(
+        method="in", robots=4, groups=4, group_order="nearest", position_loss=0.6, apf_range_m=1.5
+    ),
+    "out, bad senses, itself counted": WorldConfig(
+        method="out", robots=4, groups=3, ellipse_counts_learner=True, burst_loss=0.4, position_delay_steps=3
+    ),
     "in, all, printed": WorldConfig(method="in", robots=6, groups=2, apf_rows="all", ellipse_axes="printed"),
 }
 
@@ -175,6 +182,15 @@ def test_the_field_is_that_of_every_robot():
     expected = [repulsion(x, y, field_params(config)) for x, y in positions]
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
     assert np.isfinite(found).all() and (found[0] == 0.0).all()
+
+
+def test_a_policy_that_has_learned_with_bad_senses_always_decides():
+    config = WorldConfig(method="in", robots=4, groups=2, position_loss=0.1)
+    positions, goals = np.ones((1, 2, 4, 2), np.float32), np.ones((1, 2, 2), np.float32)
+    found = decide(make_robot(lively(config), config), positions, np.zeros((1, 2, 4), bool), goals)
+    assert found["action"][0] != NO_DECISION and np.abs(found["velocity"][0]).max() > 0.0
+    rows = found["observation"].reshape(2, 9)
+    assert not rows[:, :5].any() and not rows[:, 7:].any() and (rows[:, 5:7] == config.goal_scale_per_m).all()
 
 
 def test_without_a_robot_of_every_group_there_is_no_decision():
