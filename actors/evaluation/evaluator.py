@@ -226,12 +226,15 @@ def record_episode(spec: EnvSpec, candidate: Candidate, seed: int) -> Episode:
     worlds.seed([seed])
     observation = worlds.reset()
     states, actions, rewards = [_state_of(worlds)], list[int](), list[float]()
+    sensed, asked = [worlds.sensed_positions()[0]], list[NDArray[np.float32]]()
     outcome = Outcome.RUNNING
 
     def record() -> None:
         states.append(_state_of(worlds))
         actions.append(NO_ACTION if isinstance(action, Pilot) else int(action[0]))
         rewards.append(float(worlds.step_reward[0]))
+        sensed.append(worlds.sensed_positions()[0])
+        asked.append(worlds.asked[:, 0].copy())
 
     while outcome == Outcome.RUNNING:
         action = rule.act(observation)
@@ -248,6 +251,8 @@ def record_episode(spec: EnvSpec, candidate: Candidate, seed: int) -> Episode:
         learner=int(worlds.state.learner[0]),
         outcome=int(outcome),
         seed=seed,
+        **({"sensed": np.stack(sensed)} if spec.world.senses_badly else {}),
+        **({"asked": np.stack([*asked, np.zeros(2, np.float32)])} if spec.world.shield != "none" else {}),
     )
 
 

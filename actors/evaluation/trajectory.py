@@ -30,6 +30,10 @@ class Episode(NamedTuple):
     machine, `[T + 1, num_robots]` int8 (sim_core.swarm.flock_rules.STATE_NAMES); action `[T + 1]` int64, taken in the
     state of the same row, and reward `[T + 1]` float32, received for it (final row: NO_ACTION and 0); goal `[groups,
     2]` float32 (metres). `learner` is the index of the learning robot.
+
+    Empty unless the world has them: sensed `[T + 1, num_robots, 2]` float32 (metres), positions as the learning robot
+    senses them, NaN for none; asked `[T + 1, 2]` float32 (m/s), the velocity that was asked for in the state of the
+    same row, before the shield (final row: 0).
     """
 
     position: NDArray[np.float32]
@@ -41,9 +45,13 @@ class Episode(NamedTuple):
     learner: int
     outcome: int
     seed: int
+    sensed: NDArray[np.float32] = np.zeros((0, 0, 2), np.float32)
+    asked: NDArray[np.float32] = np.zeros((0, 2), np.float32)
 
 
 TIME_KEYS = ("position", "velocity", "machine", "action", "reward")
+SOME_HAVE = ("sensed", "asked")
+"""Keys in time that only episodes of some worlds have."""
 
 
 def save_episodes(path: Path, episodes: list[Episode], config: WorldConfig) -> None:
@@ -61,7 +69,7 @@ def save_episodes(path: Path, episodes: list[Episode], config: WorldConfig) -> N
 def _write(path: Path, episodes: list[Episode], config: WorldConfig) -> None:
     root = zarr.open_group(str(path), mode="w", zarr_format=3)
     root.attrs.update({"format": FORMAT, "config": dataclasses.asdict(config)})
-    for key in TIME_KEYS:
+    for key in (*TIME_KEYS, *(key for key in SOME_HAVE if len(getattr(episodes[0], key)))):
         root.create_array(f"data/{key}", data=np.concatenate([getattr(episode, key) for episode in episodes]))
     ends = np.cumsum([len(episode.action) for episode in episodes]).astype(np.int64)
     root.create_array("meta/episode_ends", data=ends)
@@ -87,7 +95,8 @@ def load_episodes(path: Path) -> tuple[list[Episode], WorldConfig]:
     try:
         attributes: Any = root.attrs["config"]
         ends = _read(root, "meta/episode_ends")
-        columns = {key: _read(root, f"data/{key}") for key in TIME_KEYS}
+        there = [key for key in SOME_HAVE if f"data/{key}" in root]
+        columns = {key: _read(root, f"data/{key}") for key in (*TIME_KEYS, *there)}
         meta = {key: _read(root, f"meta/{key}") for key in ("goal", "learner", "outcome", "seed")}
     except KeyError as error:
         raise ValueError(f"{path} is incomplete ({error}); record the episodes again") from error

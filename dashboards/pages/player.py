@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from actors.evaluation.trajectory import Episode
 
 INT16_MAX = 32767
+NOWHERE = -32768
+"""In place of a position: the robot is not sensed."""
 SMALLEST_UNIT_M = 0.0005
 """Smallest unit of positions; with it, velocities are exact to 0.01 m/s at a time step of 0.05 s."""
 VERDICTS = {
@@ -76,12 +78,14 @@ def player_page(title: str, data: dict[str, Any], script: str, policy: str) -> s
 def player_data(episode: Episode, config: WorldConfig) -> dict[str, Any]:
     """An episode as the player reads it, ready for JSON.
 
-    Three arrays are packed (`dashboards.pages.assets.packed`):
+    Arrays are packed (`dashboards.pages.assets.packed`):
 
     - `positions` `[T + 1, num_robots, 2]` int16: differences from state to state, the first from 0, modulo 2^16, in
       units of `metres_per_unit`; all low bytes come before all high bytes.
     - `machine` `[T + 1, num_robots]` uint8: states of the FL-ORCA machine (`sim_core.swarm.flock_rules.STATE_NAMES`).
     - `actions` `[T + 1]` int8: the learning robot's actions.
+    - `sensed`, as `positions`: where the learning robot senses the robots, -2^15 for nowhere; null if it senses well.
+    - `asked` `[T + 1, 2]` int16: the velocity asked for before the shield, mm/s; null without one.
 
     Raises:
       ValueError: the positions are not finite, or not those of `config.num_robots` robots.
@@ -93,11 +97,16 @@ def player_data(episode: Episode, config: WorldConfig) -> dict[str, Any]:
             f"these are {position.shape}, finite: {bool(np.isfinite(position).all())}"
         )
     outcome, steps = Outcome(episode.outcome), len(position) - 1
-    metres_per_unit = max(float(np.abs(position).max()) / INT16_MAX, SMALLEST_UNIT_M)
+    sensed = np.asarray(episode.sensed, np.float64)
+    farthest_m = max(float(np.abs(position).max()), float(np.nanmax(np.abs(sensed), initial=0.0)))
+    metres_per_unit = max(farthest_m / INT16_MAX, SMALLEST_UNIT_M)
+    units = np.where(np.isnan(sensed), NOWHERE, np.rint(sensed / metres_per_unit)).astype(np.int16)
     return {
         "setup": f"{config.setup}, seed {episode.seed}",
         "verdict": f"{VERDICTS[outcome]} (step {steps}, {steps * config.time_step_s:.2f} s).",
         "positions": packed(_byte_planes(np.rint(position / metres_per_unit).astype(np.int16))),
+        "sensed": packed(_byte_planes(units)) if len(sensed) else None,
+        "asked": packed(np.rint(1000 * episode.asked).astype("<i2").tobytes()) if len(episode.asked) else None,
         "metres_per_unit": metres_per_unit,
         "machine": packed(episode.machine.astype(np.uint8).tobytes()),
         "actions": packed(episode.action.astype(np.int8).tobytes()),

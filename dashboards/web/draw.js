@@ -56,6 +56,7 @@ function draw() {
   if (show.ellipses && data.ellipse) for (let group = 0; group < data.groups; group++) drawEllipse(group);
   if (show.planes) drawNeighbours();
   for (let robot = 0; robot < numRobots; robot++) if (robot !== data.learner) drawRobot(robot);
+  if (show.sensed && sensed) drawSensed();
   drawRobot(data.learner);
   if (show.planes) drawSpace();
   if (step >= data.steps) drawEnd(size);
@@ -161,6 +162,29 @@ function drawEllipse(group) {
   stroke(groupColour(group), own ? 2.2 : 1.3, own ? [] : [5, 4]);
 }
 
+// Draws what the learning robot senses: a dashed ring where it takes a robot to be, tied to where that robot is; a robot
+// that it does not sense is struck out.
+function drawSensed() {
+  const now = Math.floor(step), radius = robotRadius();
+  for (let robot = 0; robot < numRobots; robot++) {
+    if (robot === data.learner) continue;
+    const x = toX(coordinate(now, robot, 0)), y = toY(coordinate(now, robot, 1)), at = (now * numRobots + robot) * 2;
+    context.beginPath();
+    if (Number.isNaN(sensed[at])) {
+      context.moveTo(x - radius, y - radius);
+      context.lineTo(x + radius, y + radius);
+      stroke(theme.text, 1.5);
+      continue;
+    }
+    const sensedX = toX(sensed[at]), sensedY = toY(sensed[at + 1]);
+    context.moveTo(x, y);
+    context.lineTo(sensedX, sensedY);
+    stroke(theme.muted, 1);
+    circle(sensedX, sensedY, radius + 2);
+    stroke(groupColour(groupOf(robot)), 1.5, [3, 2]);
+  }
+}
+
 function drawRobot(robot) {
   const x = toX(positionOf(robot, 0)), y = toY(positionOf(robot, 1));
   const radius = robotRadius(), colour = groupColour(groupOf(robot));
@@ -187,8 +211,16 @@ function drawRobot(robot) {
 }
 
 function drawVelocity(robot, x, y) {
-  const now = Math.floor(step), scale = ARROW_S * pxPerM;
-  const vx = velocityAt(now, robot, 0) * scale, vy = -velocityAt(now, robot, 1) * scale;
+  const now = Math.floor(step);
+  drawArrow(x, y, velocityAt(now, robot, 0), velocityAt(now, robot, 1), []);
+  if (robot === data.learner && asked) {  // that of the last step, as the velocity is
+    const at = 2 * Math.max(now - 1, 0);
+    drawArrow(x, y, asked[at] / 1000, asked[at + 1] / 1000, [3, 3]);
+  }
+}
+
+function drawArrow(x, y, velocityX, velocityY, dash) {
+  const scale = ARROW_S * pxPerM, vx = velocityX * scale, vy = -velocityY * scale;
   const length = Math.hypot(vx, vy);
   if (length < 1) return;
   const head = Math.min(5, length / 2), turn = Math.atan2(vy, vx);
@@ -199,7 +231,7 @@ function drawVelocity(robot, x, y) {
     context.moveTo(x + vx, y + vy);
     context.lineTo(x + vx + head * Math.cos(turn + side), y + vy + head * Math.sin(turn + side));
   }
-  stroke(theme.text, 1.3);
+  stroke(theme.text, 1.3, dash);
 }
 
 function drawState(robot, x, y, radius) {

@@ -1,10 +1,13 @@
 // The player: the loaded episode, the step that is shown, and the controls. draw.js and orca.js draw it.
 "use strict";
 const canvas = element("canvas"), context = canvas.getContext("2d");
+const NOWHERE = -32768;  // in place of a position: the robot is not sensed
 const ARROW_S = 0.6;  // an arrow of velocity ends where the robot would be after this time
-const show = {sensing: true, ellipses: true, velocity: false, machine: false, planes: false, follow: false};
+const show = {sensing: true, sensed: true, ellipses: true, velocity: false, machine: false, planes: false, follow: false};
 let data = null;     // the episode, as from player_data in dashboards/pages/player.py
 let groupOfRobot = [], numRobots = 0, learnerGroup = 0, positions = null, machine = null, actions = null;
+let sensed = null;   // positions as the learning robot senses them, metres; null if it senses well
+let asked = null;    // velocity asked for before the shield, mm/s; null without one
 let selected = 0;    // robot whose ORCA lines are shown
 let step = 0;        // step that is shown; fractional while playing
 let playing = false;
@@ -14,12 +17,12 @@ let onEnd = () => {};  // called when playing reaches the last step
 const theme = {};
 
 // Positions in metres from their packed form: int16 differences from step to step, low bytes before high bytes. Sums
-// wrap around as int16.
+// wrap around as int16. NOWHERE becomes NaN.
 function decodePositions(bytes) {
   const count = bytes.length / 2, stride = 2 * numRobots, units = new Int16Array(count), metres = new Float32Array(count);
   for (let i = 0; i < count; i++) {
     units[i] = (bytes[i] | bytes[count + i] << 8) + (i < stride ? 0 : units[i - stride]);
-    metres[i] = units[i] * data.metres_per_unit;
+    metres[i] = units[i] === NOWHERE ? NaN : units[i] * data.metres_per_unit;
   }
   return metres;
 }
@@ -27,6 +30,7 @@ function decodePositions(bytes) {
 async function load(next) {
   const planes = await inflate(next.positions), states = await inflate(next.machine);
   const taken = new Int8Array((await inflate(next.actions)).buffer);
+  const senses = next.sensed && await inflate(next.sensed), wishes = next.asked && await inflate(next.asked);
   setPlaying(false);
   data = next;
   groupOfRobot = data.group_sizes.flatMap((size, group) => Array(size).fill(group));
@@ -35,11 +39,15 @@ async function load(next) {
   positions = decodePositions(planes);
   machine = states;
   actions = taken;
+  sensed = senses && decodePositions(senses);
+  asked = wishes && new Int16Array(wishes.buffer);
   selectRobot(nearestToLearner());
   element("setup").textContent = data.setup;
   element("verdict").textContent = data.verdict;
   element("verdict").className = "verdict " + (data.outcome === "goal" ? "success" : "failure");
   element("ellipses-toggle").hidden = !data.ellipse;
+  element("sensed-toggle").hidden = !sensed;
+  element("asked-note").hidden = !asked;
   element("scrub").max = String(data.steps);
   element("robot").max = String(numRobots);
   buildLegends();

@@ -46,6 +46,23 @@ def test_round_trip_of_episodes_of_different_lengths(path):
         assert_same(first, second)
 
 
+def test_what_only_some_worlds_have_is_stored_where_they_have_it(path):
+    episodes = [make_episode(length, seed) for seed, length in enumerate((5, 3))]
+    rng = np.random.default_rng(0)
+    full = [
+        one._replace(
+            sensed=np.where(rng.random(one.position.shape) < 0.3, np.nan, one.position).astype(np.float32),
+            asked=rng.normal(size=(len(one.action), 2)).astype(np.float32),
+        )
+        for one in episodes
+    ]
+    save_episodes(path, full, CONFIG)
+    for first, second in zip(full, load_episodes(path)[0], strict=True):
+        assert_same(first, second)
+    save_episodes(path, episodes, CONFIG)
+    assert set(zarr.open_group(str(path), mode="r")["data"].array_keys()) == set(TIME_KEYS)
+
+
 def test_the_layout_is_that_of_diffusion_policy(path):
     episodes = [make_episode(5, 0), make_episode(2, 1)]
     save_episodes(path, episodes, CONFIG)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
 import re
 import zlib
@@ -13,8 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from actors.evaluation.evaluator import record_episode
 from actors.evaluation.trajectory import Episode
+from actors.policy.baselines import Baseline
+from actors.rollout.vector_env import EnvSpec
 from dashboards.pages.player import VERDICTS, player_data, player_html
+from sim_core import ENV_ID
 from sim_core.config import WorldConfig
 from sim_core.outcomes import ENDED, OUTCOME_NAMES, Outcome
 from sim_core.render import GROUP_COLOURS, colour_rgb, to_pixels
@@ -33,8 +38,8 @@ def decoded(data: dict[str, Any], key: str, dtype: str) -> np.ndarray:
     return np.frombuffer(zlib.decompress(base64.b64decode(data[key])), dtype)
 
 
-def decoded_positions(data: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray:
-    low, high = np.split(decoded(data, "positions", "u1").astype(np.int64), 2)
+def decoded_positions(data: dict[str, Any], shape: tuple[int, ...], key: str = "positions") -> np.ndarray:
+    low, high = np.split(decoded(data, key, "u1").astype(np.int64), 2)
     units = np.cumsum((low + 256 * high).reshape(shape), axis=0)
     return ((units + 2**15) % 2**16 - 2**15) * data["metres_per_unit"]
 
@@ -71,6 +76,36 @@ def test_positions_far_outside_do_not_wrap_around(episode: Episode, config: Worl
 def test_the_data_state_who_drives_the_learning_robot(episode: Episode, failed: Episode, config: WorldConfig):
     assert player_data(episode, config)["piloted"] is False
     assert player_data(failed, config)["piloted"] is True
+
+
+@pytest.fixture(scope="module")
+def impaired_world(config: WorldConfig) -> WorldConfig:
+    """A world in which the learning robot senses badly and has a shield."""
+    return dataclasses.replace(
+        config, position_noise_m=0.1, position_loss=0.3, shield="orca", arena_radius_m=3.0, method="in"
+    )
+
+
+@pytest.fixture(scope="module")
+def impaired(impaired_world: WorldConfig) -> Episode:
+    """An episode of such a world."""
+    return record_episode(EnvSpec(ENV_ID, impaired_world), Baseline.GREEDY, seed=5)
+
+
+def test_what_is_sensed_and_asked_for_stands_beside_what_is(impaired: Episode, impaired_world: WorldConfig):
+    data = player_data(impaired, impaired_world)
+    found = decoded_positions(data, impaired.position.shape, "sensed")
+    hidden = np.isnan(impaired.sensed)
+    assert 0.1 < hidden.mean() < 0.4 and (found[hidden] == -(2**15) * data["metres_per_unit"]).all()
+    np.testing.assert_allclose(found[~hidden], impaired.sensed[~hidden], atol=0.51 * data["metres_per_unit"])
+    np.testing.assert_allclose(decoded(data, "asked", "<i2").reshape(-1, 2) / 1000, impaired.asked, atol=0.0006)
+    driven = impaired.velocity[1:, impaired.learner]
+    assert (np.abs(driven - impaired.asked[:-1]).max(axis=1) > 1e-6).any()
+
+
+def test_an_episode_without_bad_senses_or_shield_says_nothing_of_them(episode: Episode, config: WorldConfig):
+    data = player_data(episode, config)
+    assert data["sensed"] is None and data["asked"] is None
 
 
 def test_three_hundred_steps_of_twenty_robots_are_small(config: WorldConfig):
@@ -130,6 +165,29 @@ def page(browser: Any, failed: Episode, config: WorldConfig, tmp_path: Path) -> 
     open_player(browser, path)
     yield browser
     assert complaints(browser) == []
+
+
+def test_chromium_draws_what_is_sensed(browser: Any, impaired: Episode, impaired_world: WorldConfig, tmp_path: Path):
+    path = tmp_path / "player.html"
+    path.write_text(player_html(impaired, impaired_world, "title"), encoding="utf-8")
+    open_player(browser, path)
+    found = browser.execute_script("return [Array.from(sensed, x => isNaN(x) ? null : x), Array.from(asked)]")
+    sensed = np.array(found[0], float).reshape(impaired.sensed.shape)
+    np.testing.assert_allclose(sensed, impaired.sensed, atol=0.001)
+    np.testing.assert_allclose(np.array(found[1]).reshape(-1, 2) / 1000, impaired.asked, atol=0.0006)
+    picture = "return canvas.toDataURL()"
+    browser.execute_script("element('velocity').click(); seek(3)")
+    with_rings = browser.execute_script(picture)
+    browser.execute_script("element('sensed').click()")
+    assert browser.execute_script(picture) != with_rings
+    shown = "return ['sensed-toggle', 'asked-note'].map(id => !element(id).hidden)"
+    assert browser.execute_script(shown) == [True, True]
+    assert complaints(browser) == []
+
+
+def test_chromium_offers_nothing_that_an_episode_lacks(page: Any):
+    hidden = "return ['sensed-toggle', 'asked-note'].map(id => element(id).hidden)"
+    assert page.execute_script(hidden) == [True, True]
 
 
 def open_player(browser: Any, path: Path) -> None:
