@@ -14,8 +14,13 @@ START_DEADLINE_S = 300.0
 
 
 class ClusterOptions(NamedTuple):
-    """Address of the Ray cluster to join (None starts a Ray on this machine), and the deadlines of its components."""
+    """The Ray cluster to join, and how it looks after components.
+
+    `address` None starts a Ray on this machine. `spares` are kept of the rollout workers, and of shards with actors of
+    their own.
+    """
 
     address: str | None = None
     deadline_s: float = DEADLINE_S
     start_deadline_s: float = START_DEADLINE_S
+    spares: int = 0

@@ -148,6 +148,7 @@ class TrainingLoop:
             self._take_results()
             if self._progress.take_due("log"):
                 self._write_row(self._progress.row())
+                self._cluster.keep_spares()
             self._checkpoint_if_due()
         self._save_the_end()
         return self.env_steps >= self._config.total_env_steps

@@ -68,7 +68,8 @@ class ChaosRun:
     def _flags(self, fresh: bool) -> list[str]:
         deadlines = ["--deadline-s", str(self._command.deadline_s), "--start-deadline-s", "120"]
         tracking = ["--tracking-uri", self.server.uri] if fresh else []
-        return ["--runs-dir", str(self._command.out), *tracking, *deadlines]
+        spares = ["--spares", str(self._command.spares)]
+        return ["--runs-dir", str(self._command.out), *tracking, *deadlines, *spares]
 
     def inject_until_end(self) -> int:
         """Injects faults until the training ends; returns the exit code of the last driver.

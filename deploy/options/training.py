@@ -33,10 +33,14 @@ class RayOptions:
     """Seconds of silence after which a component that owes an answer is replaced (Ray only)."""
     start_deadline_s: float = START_DEADLINE_S
     """The same for a component that is starting or being restored."""
+    spares: int = 0
+    """Warm spares to keep of the rollout workers, and of shards with actors of their own (Ray only): processes with all
+    code loaded, which take a lost one's place at once. Each takes memory and, on a cluster, a CPU."""
 
     def __post_init__(self) -> None:
         require(self.deadline_s >= 1, f"--deadline-s must be at least 1, not {self.deadline_s}")
         require(self.start_deadline_s >= 1, f"--start-deadline-s must be at least 1, not {self.start_deadline_s}")
+        require(self.spares >= 0, f"--spares must not be negative, not {self.spares}")
 
     def ray_address(self) -> str | None:
         """The Ray cluster to join; None starts a Ray on this machine."""
@@ -44,7 +48,7 @@ class RayOptions:
 
     def cluster_options(self) -> ClusterOptions:
         """Where the components run, and their deadlines."""
-        return ClusterOptions(self.ray_address(), self.deadline_s, self.start_deadline_s)
+        return ClusterOptions(self.ray_address(), self.deadline_s, self.start_deadline_s, self.spares)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,6 +147,8 @@ class Chaos:
     """Mean time between two faults."""
     deadline_s: float = 10.0
     """Seconds of silence after which a component is replaced."""
+    spares: int = 1
+    """Warm spares of the run (see `shoal train`)."""
     limit_s: float = 3_600.0
     """The run counts as hung after this many seconds."""
 
@@ -151,6 +157,7 @@ class Chaos:
         require(self.faults >= 0, f"--faults must not be negative, not {self.faults}")
         require(self.every_s > 0, f"--every-s must be greater than 0, not {self.every_s}")
         require(self.deadline_s > 4, f"--deadline-s must be above 4, twice the longest delay, not {self.deadline_s}")
+        require(self.spares >= 0, f"--spares must not be negative, not {self.spares}")
         require(self.limit_s > 0, f"--limit-s must be greater than 0, not {self.limit_s}")
 
 

@@ -20,11 +20,12 @@ from actors.replay.node import ShardNode
 from actors.rollout.node import RolloutNode
 from actors.rollout.vector_env import EnvSpec, env_shape
 from actors.service.messages import EpisodeStats
-from actors.service.rpc import Handle, LocalCalls, Ref, local_handle
+from actors.service.rpc import Handle, LocalCalls, Ref, by_reference, local_handle
 from learner.cluster_options import DEADLINE_S, ClusterOptions
 from learner.config import RunConfig
 from learner.ray_backend.auth import TOKEN_HELP, guard_ray
 from learner.ray_backend.calls import RayCalls
+from learner.ray_backend.spares import Spares, SpareShard, SpareWorker
 from learner.training.cluster import (
     Cluster,
     Limits,
@@ -104,8 +105,13 @@ def learner_gpus(config: RunConfig) -> int:
     return int(have)
 
 
-def connect(cpus: int, address: str | None) -> None:
+def connect(cpus: int, address: str | None, spare_cpus: int = 0) -> None:
     """Joins the Ray cluster at `address`; if it is None, starts Ray on this machine with at least `cpus` CPU slots.
+
+    Args:
+      cpus: slots that must be there.
+      address: of the cluster.
+      spare_cpus: more slots of a Ray on this machine, for actors that wait.
 
     Raises:
       ConfigError: the cluster cannot be reached, refuses the token, or has too few CPUs.
@@ -117,7 +123,11 @@ def connect(cpus: int, address: str | None) -> None:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     options: dict[str, Any] = {"address": address}
     if address is None:
-        options = {"address": "local", "include_dashboard": False, "num_cpus": max(cpus, os.cpu_count() or 1)}
+        options = {
+            "address": "local",
+            "include_dashboard": False,
+            "num_cpus": max(cpus, os.cpu_count() or 1) + spare_cpus,
+        }
         options["_system_config"] = LOCAL_RAY
     try:
         ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
@@ -179,7 +189,8 @@ class RayCluster(Cluster):
     """
 
     def __init__(self, config: RunConfig, incarnation: int, options: ClusterOptions) -> None:
-        connect(cpus_needed(config), options.address)
+        has_shards = config.replay_placement == "actors"
+        connect(cpus_needed(config), options.address, options.spares * (1 + has_shards))
         self._shape = env_shape(config.env)
         self._node_calls = RayCalls(options.deadline_s * INNER_SHARE)
         limits = Limits(
@@ -191,6 +202,8 @@ class RayCluster(Cluster):
             eval_tasks=cluster_cpus(),
         )
         calls = RayCalls(max(options.deadline_s, options.start_deadline_s))
+        self._spare_workers = Spares(options.spares, self._start_spare_worker)
+        self._spare_shards = Spares(options.spares * has_shards, lambda: _start_actor(SpareShard, 0))
         super().__init__(config, incarnation, calls, limits)
 
     def place_learner(self) -> Handle[LearnerNode]:
@@ -198,14 +211,24 @@ class RayCluster(Cluster):
         return _start_actor(LearnerActor, learner_gpus(self.config), self.config, self.shards, self._node_calls)
 
     def place_worker(self, worker_id: int, incarnation: int) -> Handle[RolloutNode]:
-        """Starts the actor of a rollout worker."""
-        settings = rollout_settings(self.config)
-        arguments = (settings, worker_id, incarnation, self._node_calls, self.targets, PUSHES_IN_FLIGHT)
-        return _start_actor(RolloutNode, 0, *arguments)
+        """Starts the actor of a rollout worker, or makes a spare one."""
+        arguments = (worker_id, incarnation, self._node_calls, self.targets, PUSHES_IN_FLIGHT)
+        spare = self._spare_workers.take(*arguments)
+        return spare or _start_actor(RolloutNode, 0, rollout_settings(self.config), *arguments)
+
+    def _start_spare_worker(self) -> Handle[SpareWorker]:
+        weights = by_reference(self.calls.start(self.learner, LearnerNode.weights))
+        return _start_actor(SpareWorker, 0, rollout_settings(self.config), weights)
 
     def place_shard(self, index: int, incarnation: int) -> Handle[ShardNode]:
-        """Starts the actor of an empty shard."""
-        return _start_actor(ShardNode, 0, shard_settings(self.config, self._shape, incarnation)[index])
+        """Starts the actor of an empty shard, or makes a spare one."""
+        settings = shard_settings(self.config, self._shape, incarnation)[index]
+        return self._spare_shards.take(settings) or _start_actor(ShardNode, 0, settings)
+
+    def keep_spares(self) -> None:
+        """Starts the spares that are missing."""
+        self._spare_workers.keep()
+        self._spare_shards.keep()
 
     def discard(self, node: Handle[Any]) -> None:
         """Kills an actor."""
@@ -219,6 +242,8 @@ class RayCluster(Cluster):
         """Kills all actors."""
         for node in (*self.shards, self.learner, *self.workers):
             ray.kill(node)
+        for spares in (self._spare_workers, self._spare_shards):
+            spares.discard()
 
     def close(self) -> None:
         """Leaves the cluster (see `leave`)."""

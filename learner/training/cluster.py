@@ -118,6 +118,10 @@ class Cluster(ABC):
         """Makes an empty shard."""
 
     @abstractmethod
+    def keep_spares(self) -> None:
+        """Starts the warm spares that are missing, in the background."""
+
+    @abstractmethod
     def discard(self, node: Handle[Any]) -> None:
         """Ends a node."""
 
@@ -168,6 +172,9 @@ class ProcessCluster(Cluster):
     def place_shard(self, index: int, incarnation: int) -> Handle[ShardNode]:
         """Makes an empty shard."""
         return local_handle(ShardNode(shard_settings(self.config, self._shape, incarnation)[index]))
+
+    def keep_spares(self) -> None:
+        """Does nothing: a node of this process does not die by itself."""
 
     def discard(self, node: Handle[Any]) -> None:
         """Does nothing: whoever holds no handle of it frees it."""

@@ -1,0 +1,103 @@
+"""Warm spares: a spare that has begun is what a new actor would be, and it takes a lost one's place."""
+
+import dataclasses
+import os
+import time
+
+import numpy as np
+import pytest
+
+from actors.policy.policy import WeightsSnapshot
+from actors.replay.node import ShardNode
+from actors.rollout.node import RolloutNode
+from actors.rollout.vector_env import env_shape
+from actors.service.rpc import LocalCalls, local_handle
+from learner.cluster_options import ClusterOptions
+from learner.ray_backend.spares import SpareShard, SpareWorker
+from learner.training.cluster import rollout_settings, shard_settings
+from tests.integration.conftest import PATIENCE_S, SMALL
+
+
+def weights(config):
+    rng = np.random.default_rng(0)
+    sizes = [
+        int(np.prod(env_shape(config.env).observation_space.shape)),
+        *config.hidden_sizes,
+        config.world.num_actions,
+    ]
+    layers = []
+    for fan_in, fan_out in zip(sizes, sizes[1:], strict=False):
+        layers += [rng.normal(size=(fan_out, fan_in)).astype(np.float32), np.zeros(fan_out, np.float32)]
+    return WeightsSnapshot(3, 0.0, tuple(layers), 0)
+
+
+def test_a_spare_that_has_begun_is_a_new_worker_bit_for_bit():
+    settings, shape = rollout_settings(SMALL), env_shape(SMALL.env)
+    stored = []
+    for spare in (False, True):
+        shard = ShardNode(shard_settings(SMALL, shape)[0])
+        arguments = (1, 7, LocalCalls(), [local_handle(shard)], 0)
+        if spare:
+            worker = SpareWorker(settings, weights(SMALL))
+            assert worker.is_ready()
+            worker.begin(*arguments)
+        else:
+            worker = RolloutNode(settings, *arguments)
+        worker.set_weights(weights(SMALL))
+        (report,) = worker.collect(0.2)
+        assert (report.header.worker_id, report.header.incarnation, report.header.sequence) == (1, 7, 0)
+        stored.append(shard.sample(200).columns)
+    for name, column in stored[0].items():
+        np.testing.assert_array_equal(column, stored[1][name])
+
+
+def test_a_spare_shard_that_has_begun_is_empty_and_stores():
+    settings, shape = rollout_settings(SMALL), env_shape(SMALL.env)
+    shard = SpareShard()
+    assert shard.is_ready()
+    shard.begin(shard_settings(SMALL, shape, 5)[0])
+    assert shard.size() == 0
+    worker = RolloutNode(settings, 0, 0, LocalCalls(), [local_handle(shard)], 0)
+    worker.set_weights(weights(SMALL))
+    worker.collect(0.2)
+    assert shard.size() > 0
+
+
+@pytest.mark.ray
+def test_spares_take_the_places_of_lost_actors_and_are_replaced():
+    import ray
+
+    from learner.ray_backend.cluster import RayCluster
+
+    config = dataclasses.replace(SMALL, engine="ray", replay_placement="actors")
+    cluster = RayCluster(config, 0, ClusterOptions(spares=1))
+    try:
+
+        def pid(actor):
+            return ray.get(actor.__ray_call__.remote(lambda _: os.getpid()), timeout=PATIENCE_S)
+
+        waiting = [cluster._spare_workers, cluster._spare_shards]
+        assert cluster._spare_workers.take(0, 1) is None, "none has been started"
+        cluster.keep_spares()
+        cluster.keep_spares()
+        (worker, ready), (shard, other_ready) = (pair for spares in waiting for pair in spares._waiting)
+        ray.get([ready, other_ready], timeout=PATIENCE_S)
+        spare_pids = [pid(worker), pid(shard)]
+        cluster.discard(cluster.workers[0])
+        assert pid(cluster.place_worker(0, 1)) == spare_pids[0]
+        assert pid(cluster.place_shard(0, 1)) == spare_pids[1]
+        assert not any(spares._waiting for spares in waiting)
+
+        cluster.keep_spares()
+        ((dead, ready),) = cluster._spare_workers._waiting
+        ray.get(ready, timeout=PATIENCE_S)
+        number = pid(dead)
+        ray.kill(dead)
+        end_s = time.monotonic() + PATIENCE_S
+        while os.path.exists(f"/proc/{number}") and time.monotonic() < end_s:
+            time.sleep(0.05)
+        made = cluster.place_worker(0, 2)  # a spare that died after it was ready is found out by its first call
+        with pytest.raises(ray.exceptions.RayActorError):
+            ray.get(made.set_weights.remote(weights(config)), timeout=PATIENCE_S)
+    finally:
+        cluster.close()
