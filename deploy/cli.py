@@ -56,6 +56,9 @@ JOBS = ("train", "sweep")
 BAD_PATH_ERRORS = (errno.ENAMETOOLONG, errno.EILSEQ, errno.ELOOP)
 """Errors of paths that no file can have. A command may meet them wherever it first opens the path."""
 
+FORBIDDEN_ERRORS = (errno.EACCES, errno.EPERM, errno.EROFS)
+"""Errors of paths that are another user's, or on a disk that takes nothing."""
+
 
 def config_file(named: Path) -> Path:
     """The file that `--config` names: a path, or the name of a config that is part of shoal, such as `cartpole`."""
@@ -173,6 +176,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except OSError as error:
+        if error.errno in FORBIDDEN_ERRORS:
+            print(f"shoal: {error.filename} may not be used by you ({error.strerror}); ask its owner", file=sys.stderr)
+            return BAD_INPUT
         if error.errno not in BAD_PATH_ERRORS:
             raise
         name = str(error.filename)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from actors.storage.atomic_write import replacing_file
+from actors.storage.permissions import may_not_read, may_not_write
 from actors.storage.uri import Location, parse_location
 from learner import file_names
 from learner.config import RunConfig, from_dict, to_dict, user_files
@@ -65,10 +66,14 @@ class RunFolder:
         """Locks the run against training by other processes; the lock ends with the `with` block or the process.
 
         Raises:
-          ConfigError: another process has locked it.
+          ConfigError: another process has locked it, or the folder may not be written to.
         """
         self.path.mkdir(parents=True, exist_ok=True)
-        with (self.path / file_names.LOCK).open("w") as file:
+        try:
+            lock = (self.path / file_names.LOCK).open("w")
+        except PermissionError as error:
+            raise ConfigError(may_not_write(self.path)) from error
+        with lock as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
@@ -166,6 +171,8 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
 def _read(path: Path) -> dict[str, Any]:
     try:
         values = json.loads(path.read_text("utf-8-sig"))
+    except PermissionError as error:
+        raise ConfigError(may_not_read(path)) from error
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path} cannot be read ({error}); name another run or start a new one") from error
     if not isinstance(values, dict):

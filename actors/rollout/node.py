@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
+from safetensors.numpy import save as to_bytes
 
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.worker import RolloutSettings, RolloutWorker
@@ -184,7 +185,7 @@ class RolloutNode:
         if self._pushes:
             raise RuntimeError("pushes are in flight; settle before the state is saved")
         state = self._worker.get_state()
-        self._writer.start(location, lambda path: save_file(state["arrays"], str(path)))
+        self._writer.start(location, lambda path: path.write_bytes(to_bytes(state["arrays"])))
         return {**state["meta"], "next_shard": self._next_shard}
 
     def saved(self, timeout_s: float = 0.0) -> WriteResult | None:

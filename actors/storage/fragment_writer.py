@@ -45,7 +45,7 @@ class FragmentWriter:
         self._is_blocked = False
         self._result = WriteResult({}, "nothing was being written: the process has restarted")
 
-    def start(self, location: Location, write: Callable[[Path], None]) -> bool:
+    def start(self, location: Location, write: Callable[[Path], object]) -> bool:
         """Starts to write a file or folder.
 
         Args:
@@ -62,7 +62,7 @@ class FragmentWriter:
         self._thread.start()
         return True
 
-    def _write(self, location: Location, write: Callable[[Path], None]) -> None:
+    def _write(self, location: Location, write: Callable[[Path], object]) -> None:
         try:
             with staged(location) as local:
                 write(local)

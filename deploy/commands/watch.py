@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
 from actors.evaluation.evaluator import record_episode
@@ -14,6 +15,7 @@ from deploy.console.terminal import plain_console
 from deploy.live import live_server
 from deploy.options.results import Watch
 from deploy.runs.artifacts import foreign_animation, write_player, write_video
+from deploy.runs.folders import make_folder
 from deploy.runs.policy_lookup import find_policy
 from learner.config import RunConfig
 from learner.run_folder import find_run
@@ -35,9 +37,9 @@ def run(command: Watch) -> int:
         check_video_packages()
     weights = find_policy(folder, config, command.checkpoint)
     path = command.out or folder.artifacts / f"episode-{command.seed}.{command.format}"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent, "--out" if command.out else "without --out, the run's folder")
     if config.env.is_swarm:
-        _render_swarm(config, weights, command, folder.artifacts, path)
+        _render_swarm(config, weights, command, path)
     else:
         require(command.format == "mp4", f"{config.env_id} can only be watched as a video; use --format mp4")
         made = foreign_animation(config, weights, command.seed, path)
@@ -46,15 +48,16 @@ def run(command: Watch) -> int:
     return 0
 
 
-def _render_swarm(config: RunConfig, weights: WeightsSnapshot, command: Watch, artifacts: Path, path: Path) -> None:
-    store = artifacts / f"episode-{command.seed}.zarr"
-    store.parent.mkdir(parents=True, exist_ok=True)
+def _render_swarm(config: RunConfig, weights: WeightsSnapshot, command: Watch, path: Path) -> None:
+    """Writes the episode to `path`; in the run's artifacts it is kept as zarr, too."""
     episode = record_episode(config.env, weights, command.seed)
-    save_episodes(store, [episode], config.world)
-    if command.format == "html":
-        write_player(store, path, f"{config.world.method_name} {config.world.setup}")
-    elif command.format == "mp4":
-        write_video(store, path)
-    else:
-        episode_strip_png(episode, config.world, path)
+    with tempfile.TemporaryDirectory(prefix="shoal-") as folder:
+        store = Path(folder) / "episode.zarr" if command.out else path.with_suffix(".zarr")
+        save_episodes(store, [episode], config.world)
+        if command.format == "html":
+            write_player(store, path, f"{config.world.method_name} {config.world.setup}")
+        elif command.format == "mp4":
+            write_video(store, path)
+        else:
+            episode_strip_png(episode, config.world, path)
     plain_console().print(f"{len(episode.action) - 1} env steps, outcome {OUTCOME_NAMES[episode.outcome]}")

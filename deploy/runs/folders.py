@@ -46,7 +46,8 @@ def make_folder(path: Path, flag: str) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{flag} {path} cannot be made ({error}); name a folder that you may write to") from error
-    require(os.access(path, os.W_OK), f"{flag} {path} cannot be written to; name a folder that you may write to")
+    may_write = os.access(path, os.W_OK, effective_ids=True)
+    require(may_write, f"{flag} {path} cannot be written to; name a folder that you may write to")
 
 
 def run_location(checkpoint_url: str, name: str) -> Location:

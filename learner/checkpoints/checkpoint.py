@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from actors.storage.fragment_writer import FileSum
+from actors.storage.permissions import may_not_read
 from actors.storage.uri import Location
 from learner.checkpoints.manifest import (
     MANIFEST,
@@ -127,6 +128,8 @@ def read_checkpoint(store: CheckpointStore, name: str) -> Checkpoint:
 def _open(store: CheckpointStore, name: str, file: str) -> OpenFile:
     try:
         return store.open(name, file)
+    except PermissionError as error:
+        raise CheckpointError(may_not_read(f"checkpoint {store.location(name)}")) from error
     except (OSError, ValueError) as error:
         raise damaged(store.location(name), f"{file}: {error}") from error
 

@@ -97,7 +97,8 @@ class FolderStore:
 
     def names(self) -> list[str]:
         """Committed ones; a checkpoint that was being replaced (`.old`) counts until its successor has its name."""
-        found = [path.name for path in self._root.glob(f"{PREFIX}*") if NAME.fullmatch(path.name) and path.is_dir()]
+        there = os.listdir(self._root) if self._root.is_dir() else []  # raises where it may not be listed
+        found = [name for name in there if NAME.fullmatch(name) and (self._root / name).is_dir()]
         valid = (name for name in found if not name.endswith(".old") or name.removesuffix(".old") not in found)
         return sorted(valid, key=_by_age, reverse=True)
 

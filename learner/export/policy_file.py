@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from actors.policy.network import Network, load_snapshot, snapshot
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import EnvShape
 from actors.storage.atomic_write import replacing_file
+from actors.storage.permissions import may_not_read
 from actors.storage.uri import fetched, join_location
 from learner.checkpoints.checkpoint import Checkpoint
 from learner.checkpoints.manifest import CheckpointError, damaged
@@ -43,7 +45,7 @@ def save_policy(path: Path, weights: WeightsSnapshot, config: RunConfig, shape: 
     load_snapshot(network, weights)
     tensors = {f"{ONLINE}{name}": tensor for name, tensor in network.state_dict().items()}
     with replacing_file(path) as partial:
-        save_file(tensors, str(partial), metadata={"updates": str(weights.version)})
+        partial.write_bytes(to_bytes(tensors, metadata={"updates": str(weights.version)}))
 
 
 def read_saved_policy(path: Path, config: RunConfig, shape: EnvShape) -> WeightsSnapshot:
@@ -55,6 +57,8 @@ def read_saved_policy(path: Path, config: RunConfig, shape: EnvShape) -> Weights
     try:
         with safe_open(str(path), "pt") as file:
             updates = int((file.metadata() or {})["updates"])
+    except PermissionError as error:
+        raise CheckpointError(may_not_read(path)) from error
     except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise CheckpointError(f"the policy {path} cannot be read ({error}); start a new run") from error
     return _read(path, updates, acting_network(config, shape))

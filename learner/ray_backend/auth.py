@@ -28,7 +28,7 @@ TOKEN_HELP = (
 def has_token() -> bool:
     """Whether Ray would find a token: in RAY_AUTH_TOKEN, in the file RAY_AUTH_TOKEN_PATH, or in ~/.ray/auth_token."""
     path = os.environ.get("RAY_AUTH_TOKEN_PATH")
-    file = Path(path) if path else Path.home() / ".ray" / "auth_token"
+    file = Path(path or os.path.expanduser("~/.ray/auth_token"))  # a user without a home has none
     return bool(os.environ.get(TOKEN)) or file.is_file()
 
 

@@ -7,8 +7,10 @@ embedded in the learner's actor, or with `replay_placement = "actors"` each is a
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, TypeVar, TypeVarTuple
 
 import psutil
@@ -26,6 +28,7 @@ from learner.config import RunConfig
 from learner.ray_backend.auth import TOKEN_HELP, guard_ray
 from learner.ray_backend.calls import RayCalls
 from learner.ray_backend.spares import Spares, SpareShard, SpareWorker
+from learner.ray_backend.temp_folder import own_temp_folder
 from learner.training.cluster import (
     Cluster,
     Limits,
@@ -59,6 +62,8 @@ Idle worker processes are kept: an evaluation is a task beside actors that take 
 process after a second and start the next one from nothing. The last 100,000 calls are not recorded: that takes 300 MB,
 and only Ray's dashboard shows them. Blocks of up to 1 MiB travel in the call itself: above Ray's default of 100 KiB
 they would go through the object store, which costs several more calls."""
+_own_folders: list[Path] = []
+"""The folder of the Ray that this process has started, where it is not the one that Ray takes by itself."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
@@ -129,6 +134,10 @@ def connect(cpus: int, address: str | None, spare_cpus: int = 0) -> None:
             "num_cpus": max(cpus, os.cpu_count() or 1) + spare_cpus,
         }
         options["_system_config"] = LOCAL_RAY
+        own = own_temp_folder()
+        if own is not None:
+            options["_temp_dir"] = str(own)
+            _own_folders.append(own)
     try:
         ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
     except (ConnectionError, AuthenticationError) as error:
@@ -157,6 +166,8 @@ def leave() -> None:
     for process in workers:
         with suppress(psutil.NoSuchProcess):
             process.kill()
+    while _own_folders:
+        shutil.rmtree(_own_folders.pop(), ignore_errors=True)
 
 
 def evaluate_in_tasks(

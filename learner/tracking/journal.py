@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from actors.storage.atomic_write import replacing_file
+from actors.storage.permissions import may_not_read
 from sim_core.checks import ConfigError
 
 ACCOUNT = "account/"
@@ -120,6 +121,8 @@ def read_rows(path: Path) -> list[Row]:
         return [Row(*json.loads(line)) for line in lines]
     except FileNotFoundError:
         return []
+    except PermissionError as error:
+        raise ConfigError(may_not_read(path)) from error
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"the metrics {path} cannot be read ({error}); restore the whole file") from error
 

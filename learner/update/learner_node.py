@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as to_bytes
 
 from actors.policy.baselines import Baseline, MethodRule
 from actors.policy.policy import WeightsSnapshot
@@ -236,7 +237,7 @@ class LearnerNode:
         """
         self._await_priority_updates()
         tensors = self._learner.get_state()
-        self._writer.start(join_location(location, WEIGHTS), lambda path: save_file(tensors, str(path)))
+        self._writer.start(join_location(location, WEIGHTS), lambda path: path.write_bytes(to_bytes(tensors)))
         refs = [
             self._calls.start(shard, ShardNode.save, _shard_folder(location, i)) for i, shard in enumerate(self._shards)
         ]

@@ -1,8 +1,14 @@
 """Bad input on the command line: exit code 2, a sentence that says what and how to mend it, no traceback."""
 
+import contextlib
 import dataclasses
+import importlib
 import json
+import os
 import shutil
+import stat
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import mlflow
@@ -154,6 +160,34 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def shared() -> Iterator[Path]:
+    """A folder that other users reach, unlike pytest's own."""
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o755)
+    yield folder
+    shutil.rmtree(folder)
+
+
+@contextlib.contextmanager
+def as_another_user(runs: Path, hidden: list[Path]) -> Iterator[None]:
+    """Acts as a user who may read everything but `hidden`, and write nothing there; an administrator becomes nobody."""
+    for name in ("evaluate", "resume", "watch"):
+        importlib.import_module(f"deploy.commands.{name}")  # nobody may not read the administrator's Python
+    before = {path: path.stat().st_mode for path in [runs, *runs.rglob("*")]}
+    for path, mode in reversed(before.items()):
+        path.chmod(0 if path in hidden else mode & ~0o222 | 0o444)
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(user)
+        for path, mode in before.items():
+            path.chmod(mode)
+
+
+@pytest.fixture
 def runs(finished: Path, tmp_path: Path) -> Path:
     """A copy that a test may damage."""
     return Path(shutil.copytree(finished, tmp_path / "runs"))
@@ -204,6 +238,50 @@ class TestWithARun:
         assert (finished / "mlflow.db").read_bytes() == before
         capsys.readouterr()
         assert run(capsys, "relocate", "--runs-dir", str(moved / "r"))[0] == 2
+
+    def test_every_file_follows_the_umask(self, finished):
+        mask = os.umask(0)
+        os.umask(mask)
+        wrong = [
+            path
+            for path in finished.rglob("*")
+            if stat.S_IMODE(path.stat().st_mode) != (0o777 if path.is_dir() else 0o666) & ~mask
+        ]
+        assert not wrong
+
+    @pytest.mark.parametrize(
+        ("hidden", "command", "words"),
+        [
+            ("", ["resume", "--total-env-steps", "9000"], "may not be written to by you"),
+            ("", ["watch"], "cannot be written to"),
+            ("config.json", ["watch"], "config.json may not be read by you"),
+            ("run.json", ["resume", "--total-env-steps", "9000"], "may not be"),
+            ("checkpoints/*/learner.safetensors", ["watch", "--out"], "may not be read by you"),
+            ("checkpoints/*", ["evaluate"], "may not be read by you"),
+            ("checkpoints", ["evaluate"], "cannot be listed"),
+            (".", ["evaluate"], "may not be used by you"),
+        ],
+    )
+    def test_another_users_run_may_not_be_used(self, capsys, finished, hidden, command, words, shared):
+        """Whoever may not read a file is told so, and not that it is damaged."""
+        runs = Path(shutil.copytree(finished, shared / "runs"))
+        name, *more = command
+        out = [str(shared / "e.html")] if more == ["--out"] else []
+        with as_another_user(runs, [*runs.glob(f"r/{hidden}")] if hidden else []):
+            code, error = run(capsys, name, "r", "--runs-dir", str(runs), *more, *out)
+        assert code == 2 and words in error
+        assert "Traceback" not in error and "damaged" not in error and error.count("\n") == 1
+
+    def test_another_user_watches_a_run_into_a_file_of_their_own(self, capsys, finished, shared):
+        runs = Path(shutil.copytree(finished, shared / "runs"))
+        (shared / "mine").mkdir()
+        (shared / "mine").chmod(0o777)
+        out = shared / "mine" / "e.html"
+        assert main(["watch", "r", "--runs-dir", str(runs), "--out", str(out)]) == 0
+        out.unlink()
+        with as_another_user(runs, []):
+            assert run(capsys, "watch", "r", "--runs-dir", str(runs), "--out", str(out)) == (0, "")
+        assert [path.name for path in out.parent.iterdir()] == ["e.html"]
 
     @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
     def test_a_run_of_another_device_is_resumed_elsewhere(self, capsys, runs):

@@ -1,7 +1,9 @@
 """A Ray of our own leaves nothing behind, not even a process that hangs in its own end."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import psutil
 import pytest
@@ -23,6 +25,7 @@ class Part:
 connect(2, None)
 parts = [ray.remote(num_cpus=1)(Part).remote() for _ in range(2)]
 print(*ray.get([part.pid.remote() for part in parts]))
+print(os.path.dirname(ray._private.worker._global_node.get_session_dir_path()))
 del parts[0]  # Ray asks it to go, and takes it for gone
 time.sleep(2)
 leave()
@@ -41,7 +44,13 @@ def has_gone(pid):
     return True
 
 
-def test_a_process_that_hangs_does_not_outlive_our_own_ray():
-    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True)
+def test_a_process_that_hangs_does_not_outlive_our_own_ray(tmp_path):
+    """Ray starts although TMPDIR is too long for a socket's path, and its folder goes with it."""
+    before = set(Path("/tmp").glob("shoal-ray-*"))
+    env = os.environ | {"TMPDIR": str(tmp_path / ("x" * 100))}
+    env.pop("RAY_TMPDIR", None)
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, env=env)
     assert done.returncode == 0, done.stderr
-    assert [has_gone(int(pid)) for pid in done.stdout.split()] == [True, True]
+    (folder,) = map(Path, done.stdout.splitlines()[1:])
+    assert folder.name.startswith("shoal-ray-") and not folder.exists() and folder not in before
+    assert [has_gone(int(pid)) for pid in done.stdout.splitlines()[0].split()] == [True, True]

@@ -27,6 +27,12 @@ def test_a_cluster_is_joined_without_a_token_if_the_user_has_none():
     assert mode(joins=True) == "disabled"
 
 
+def test_a_user_without_a_home_has_no_token(monkeypatch):
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr(os, "getuid", lambda: 2**31 - 7)  # whom the system does not know
+    assert mode(joins=True) == "disabled"
+
+
 def test_a_local_ray_listens_on_loopback_and_requires_its_own_token():
     assert mode(joins=False) == "token" and os.environ[REMOTE] == "0"
     token = os.environ["RAY_AUTH_TOKEN"]

@@ -304,16 +304,16 @@ def test_late_writes_of_a_replaced_component_are_in_no_checkpoint(run, config, t
             return "dies before"
         return None
 
-    save_file = rollout_node.save_file
+    to_bytes = rollout_node.to_bytes
     writers = []
 
-    def slow_save(arrays, path):
+    def slow_save(arrays):
         writers.append(threading.current_thread())
         if len(writers) == 1:
             go_on.wait(60)
-        save_file(arrays, path)
+        return to_bytes(arrays)
 
-    monkeypatch.setattr(rollout_node, "save_file", slow_save)
+    monkeypatch.setattr(rollout_node, "to_bytes", slow_save)
     config = dataclasses.replace(config, workers=1)
     loop, _, listener, _ = run(config, fault)
     go_on.set()
