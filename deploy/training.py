@@ -5,6 +5,8 @@ from __future__ import annotations
 import shlex
 import signal
 
+from actors.rollout.env_guard import env_guard
+from actors.rollout.vector_env import env_shape
 from deploy.console.summary_tables import evaluation_table, setups_table, summary_lines
 from deploy.console.terminal import plain_console
 from deploy.console.training_display import make_display
@@ -25,6 +27,16 @@ def check_device(config: RunConfig, address: str | None) -> None:
     """Raises ConfigError if this machine lacks the config's device; a cluster's is checked once Ray has joined it."""
     if config.engine == "process" or address is None:
         learning_device(config.device)
+
+
+def check_environment(folder: RunFolder, config: RunConfig, deadline_s: float) -> None:
+    """Rehearses the run's environment, so that nothing starts if it does what it must not.
+
+    Raises:
+      ConfigError: see `env_shape`; a user's own traceback is kept in the run's folder.
+    """
+    with folder.traceback_kept(), env_guard(deadline_s):
+        env_shape(config.env)
 
 
 def open_tracker(folder: RunFolder) -> Tracker:
@@ -50,9 +62,11 @@ def resume_training(
     """Resumes a run from a checkpoint, or from its start if it has none; returns the exit code.
 
     Raises:
-      ConfigError: the config's device is not there, or a user's own method or scene has changed.
+      ConfigError: the config's device is not there, or a user's own method or scene has changed, or its environment
+        does what it must not.
     """
     check_files_unchanged(config)
+    check_environment(folder, config, options.deadline_s)
     check_device(config, options.address)
     identity = folder.identity()
     tracker.resume(identity.mlflow_run_id)

@@ -17,7 +17,7 @@ from actors.evaluation.evaluator import evaluate
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.exploration import epsilon
 from actors.rollout.node import RolloutNode
-from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, FaultTracker
+from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, Diverged, FaultTracker
 from actors.service.messages import BlockReport, EpisodeStats
 from actors.service.rpc import Placed, by_reference
 from actors.storage.uri import Location
@@ -124,10 +124,19 @@ class TrainingLoop:
           RuntimeError: nothing is in flight and nothing may start.
           RunLost: a component failed that only a checkpoint can bring back.
           RunFailed: a component failed again and again.
+          Diverged: numbers of the learner are no longer finite; the checkpoints hold finite ones only.
           ComponentFailed: a component failed before the first round.
         """
         try:
             return self._run()
+        except Diverged as diverged:
+            self._checkpoints.wait()  # what is being written is from before
+            self._abandon()
+            kept = f"the last checkpoint, {self._checkpoints.newest}," if self._checkpoints.newest else "no checkpoint"
+            raise Diverged(
+                f"the training has diverged: {diverged}, at env step {self.env_steps:,}; {kept} has finite numbers; "
+                "lower learning_rate or the scale of the rewards"
+            ) from diverged
         except Exception:
             self._abandon()
             raise

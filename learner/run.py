@@ -8,14 +8,15 @@ starts from the newest checkpoint.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from functools import cached_property
 from typing import NamedTuple
 
 from actors.evaluation.evaluator import evaluate_in_parallel
 from actors.policy.policy import WeightsSnapshot
+from actors.rollout.env_guard import env_guard
 from actors.rollout.worker import join_stats, select_stats
-from actors.service.fault_policy import CallFailed, ComponentFailed, FaultTracker, RunFailed, first_line
+from actors.service.fault_policy import STEADY_CALLS, CallFailed, ComponentFailed, FaultTracker, RunFailed, first_line
 from actors.service.messages import EpisodeStats
 from actors.storage.uri import Location
 from learner.checkpoints.checkpoint import Checkpoint, check_config, check_state, newest_valid
@@ -84,7 +85,7 @@ class RunSession:
         self._display = display
         self._options = options
         self._fault_log = FaultLog(folder.faults)
-        self._fault_tracker = FaultTracker()
+        self._fault_tracker = FaultTracker(1 if config.env.is_swarm else STEADY_CALLS)
 
     def execute(self, checkpoint: Checkpoint | None, finish: Callable[[RunResult, list[Row]], None]) -> RunResult:
         """Trains to the end, evaluates, logs the result and ends the MLflow run.
@@ -98,11 +99,13 @@ class RunSession:
           How the session ended. The MLflow run is FINISHED, or KILLED if a signal stopped it; then it can be resumed.
 
         Raises:
-          RunFailed: a component fails again and again; the MLflow run is FAILED.
+          RunFailed: a component fails again and again, or the training diverges; the MLflow run is FAILED.
+          ConfigError: a user's own code does what it must not; the MLflow run is FAILED.
         """
         status = "FAILED"
         try:
-            result, rows = self._train_and_evaluate(checkpoint)
+            with self._folder.traceback_kept(), self._guard():
+                result, rows = self._train_and_evaluate(checkpoint)
             if result.evaluation is not None:
                 self._log(result, result.evaluation, rows, finish)
             status = "FINISHED" if result.stopped_by is None else "KILLED"
@@ -112,6 +115,12 @@ class RunSession:
             raise
         finally:
             self._end(status)
+
+    def _guard(self) -> AbstractContextManager[None]:
+        """Keeps a foreign environment of this process from hanging or leaving it; over Ray, deadlines do."""
+        config = self._config
+        is_needed = config.engine == "process" and not config.env.is_swarm
+        return env_guard(self._options.deadline_s) if is_needed else nullcontext()
 
     def _train_and_evaluate(self, checkpoint: Checkpoint | None) -> tuple[RunResult, list[Row]]:
         """Makes attempts until one succeeds; returns its result and all rows of metrics."""
@@ -286,4 +295,7 @@ def final_evaluation(config: RunConfig, cluster: Cluster, weights: WeightsSnapsh
             [evaluate_in_parallel(cluster.calls, spec, shared, seeds, cluster.limits.eval_tasks) for spec in specs]
         )
     except CallFailed as failure:
-        raise RunFailed(f"the evaluation at the end {failure.fault} again and again: {failure.reason}") from failure
+        whose = "" if config.env.is_swarm else f" of env_id {config.env_id!r}"
+        raise RunFailed(
+            f"the evaluation{whose} at the end {failure.fault} again and again: {failure.reason}"
+        ) from failure

@@ -10,12 +10,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from actors.rollout.foreign_env import EnvError
 from actors.storage.atomic_write import replacing_file
 from actors.storage.permissions import may_not_read, may_not_write
 from actors.storage.uri import Location, parse_location
 from learner import file_names
 from learner.config import RunConfig, from_dict, to_dict, user_files
 from sim_core.checks import ConfigError, require
+
+
+REFUSED = {file_names.LOCK, file_names.ENV_TRACE}
+"""Files of a run that was refused at its start."""
 
 
 class RunIdentity(NamedTuple):
@@ -57,9 +62,28 @@ class RunFolder:
         return self._identity.is_file()
 
     def is_taken(self) -> bool:
-        """Whether there is anything here; a lock alone is what a start leaves that was refused."""
+        """Whether there is anything here, beside what a start leaves that was refused."""
         here = self.path
-        return here.exists() and not (here.is_dir() and {each.name for each in here.iterdir()} <= {file_names.LOCK})
+        return here.exists() and not (here.is_dir() and {each.name for each in here.iterdir()} <= REFUSED)
+
+    @contextmanager
+    def traceback_kept(self) -> Iterator[None]:
+        """Within the `with` block, keeps the traceback of what a foreign environment raises, and names its file.
+
+        Raises:
+          EnvError: as the block raised it, with the file.
+        """
+        path = self.path / file_names.ENV_TRACE
+        path.unlink(missing_ok=True)
+        try:
+            yield
+        except EnvError as error:
+            if not error.trace:
+                raise
+            self.path.mkdir(parents=True, exist_ok=True)
+            with replacing_file(path) as partial:
+                partial.write_text(error.trace, "utf-8", "backslashreplace")
+            raise EnvError(f"{error}; its traceback is in {path}") from error
 
     @contextmanager
     def lock(self) -> Iterator[None]:

@@ -170,7 +170,7 @@ def _module(kind: Kind, file_name: str, source: str) -> ModuleType:
         spec.loader.exec_module(module)
     except Exception as error:
         del sys.modules[name]
-        raise PluginError(f"{kind.setting}: {blame(error, path)}: {_reason(error)}") from error
+        raise PluginError(f"{kind.setting}: {blame(error, path)}: {reason_of(error)}") from error
     return module
 
 
@@ -218,8 +218,12 @@ def blame(error: BaseException, path: Path) -> str:
     return f"{path.name}, line {frames[-1].lineno}" if frames else path.name
 
 
-def _reason(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+def reason_of(error: BaseException) -> str:
+    """What an error says: its type and the first line of its message."""
+    try:
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    except Exception:  # a user's own exception may not know how to say what it is
+        lines = []
     return f"{type(error).__name__}: {lines[0] if lines else ''}".rstrip(": ")
 
 
@@ -240,9 +244,8 @@ class guarded:  # noqa: N801  # reads as a statement
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if isinstance(error, Exception) and not isinstance(error, ConfigError):
-            raise PluginError(
-                f"{blame(error, source_file(self._cls))}: {self._doing} of {self._cls.__name__} raised {_reason(error)}"
-            ) from error
+            place = blame(error, source_file(self._cls))
+            raise PluginError(f"{place}: {self._doing} of {self._cls.__name__} raised {reason_of(error)}") from error
 
 
 def source_file(cls: type[Any]) -> Path:

@@ -5,17 +5,20 @@ The same loop plays learned policies, which act greedily, and baselines.
 
 from __future__ import annotations
 
-import warnings
+import math
+from collections.abc import Iterator
+from contextlib import closing
 from itertools import count, pairwise
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from actors.evaluation.trajectory import NO_ACTION, Episode
 from actors.policy.baselines import ActionRule, Baseline, make_baseline
 from actors.policy.policy import Policy, WeightsSnapshot
+from actors.rollout.foreign_env import EnvError, ForeignVectorEnv
+from actors.rollout.foreign_spaces import shown
 from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
 from actors.rollout.worker import join_stats, select_stats
 from actors.service.fault_policy import Action, CallFailed, ComponentKind, decide
@@ -28,6 +31,14 @@ from sim_core.worlds import Pilot, WorldBatch, is_done
 
 MAX_ENVS = 250
 """Most environments stepped together."""
+MAX_EPISODE_STEPS = 100_000
+"""Longest episode of a foreign environment in an evaluation; one that never ends would keep a run from its end."""
+RGB = "rgb_array"
+"""Render mode of environments that draw images."""
+FRAMES_PER_S = 30.0
+"""Images per second where an environment does not say."""
+MAX_FRAMES = 10_000
+"""Most images of a recorded episode."""
 
 Candidate = WeightsSnapshot | Baseline
 """What is evaluated, as data that can be sent to another process: a policy's weights, or a baseline's name."""
@@ -185,19 +196,24 @@ class _GymEpisodes:
 
     def __init__(self, spec: EnvSpec, seeds: list[int]) -> None:
         self._env = make_vector_env(spec, len(seeds))
+        self._env_id = spec.env_id
         self._seeds = seeds
         self._steps = np.zeros(len(seeds), np.int32)
+        self._outcome = np.full(len(seeds), NO_OUTCOME, np.int8)
 
     def start(self) -> NDArray[Any]:
         return reset_seeded(self._env, self._seeds)
 
     def step(self, action: NDArray[np.int64] | Pilot) -> _Step:
-        observation, reward, terminated, truncated, infos = self._env.step(action)
-        outcome = infos.get("final_info", {}).get("outcome")
-        if outcome is None:
-            outcome = np.full(len(self._seeds), NO_OUTCOME, np.int8)
+        assert not isinstance(action, Pilot)
+        observation, reward, terminated, truncated, _ = self._env.step(action)
         self._steps += 1
-        return _Step(observation, reward, terminated | truncated, outcome, self._steps)
+        if self._steps[0] > MAX_EPISODE_STEPS:
+            raise EnvError(
+                f"env_id {self._env_id!r}: an evaluated episode has not ended after {MAX_EPISODE_STEPS:,} steps; give "
+                "the environment a time limit, such as max_episode_steps of gymnasium.register"
+            )
+        return _Step(observation, reward, terminated | truncated, self._outcome, self._steps)
 
     def close(self) -> None:
         self._env.close()
@@ -256,30 +272,47 @@ def record_episode(spec: EnvSpec, candidate: Candidate, seed: int) -> Episode:
     )
 
 
-def record_frames(spec: EnvSpec, weights: WeightsSnapshot, seed: int) -> tuple[list[NDArray[np.uint8]], float]:
-    """Plays one greedy episode of any Gymnasium environment and records its images.
+def record_frames(spec: EnvSpec, weights: WeightsSnapshot, seed: int) -> tuple[Iterator[NDArray[np.uint8]], float]:
+    """Plays one greedy episode of any Gymnasium environment and draws every step, until `MAX_FRAMES`.
 
     Returns:
-      (images `[height, width, 3]` uint8, images per second); no images if the environment has no `rgb_array` mode.
+      (images `[height, width, 3]` uint8, drawn as they are asked for; images per second).
+
+    Raises:
+      ConfigError: it cannot be drawn, at once or while images are asked for.
     """
-    policy = Policy(weights)
-    try:
-        with warnings.catch_warnings(action="ignore"):  # of an environment without this mode
-            env = gym.make(spec.env_id, render_mode="rgb_array")
-    except (TypeError, gym.error.Error):
-        return [], 0.0
-    if "rgb_array" not in env.metadata.get("render_modes", []):
-        env.close()
-        return [], 0.0
-    frames_per_s = float(env.metadata.get("render_fps", 30))
-    observation, _ = env.reset(seed=seed)
-    frames, ended = list[NDArray[np.uint8]](), False
-    while not ended:
-        frames.append(np.asarray(env.render(), np.uint8))
-        observation, _, terminated, truncated, _ = env.step(policy.greedy(observation[None])[0])
-        ended = terminated or truncated
-    env.close()
-    return frames, frames_per_s
+    with closing(ForeignVectorEnv(spec.env_id, 1)) as plain:
+        modes = plain.metadata.get("render_modes")
+    has_mode = isinstance(modes, list | tuple) and RGB in modes
+    require(has_mode, f"env_id {spec.env_id!r} has no render mode {RGB}; it has {shown(modes)}")
+    env = ForeignVectorEnv(spec.env_id, 1, RGB)
+    rate = env.metadata.get("render_fps")
+    frames_per_s = float(rate) if isinstance(rate, int | float) and 0 < rate < math.inf else FRAMES_PER_S
+    return _frames(env, Policy(weights), seed), frames_per_s
+
+
+def _frames(env: ForeignVectorEnv, policy: Policy, seed: int) -> Iterator[NDArray[np.uint8]]:
+    with closing(env):
+        observation = reset_seeded(env, [seed])
+        shape = None
+        for _ in range(MAX_FRAMES):
+            image = _image(env)
+            shape = shape or image.shape
+            require(image.shape == shape, f"env_id {env.env_id!r}: render() gave images of several sizes")
+            yield image
+            observation, _, terminated, truncated, _ = env.step(policy.greedy(observation))
+            if terminated[0] or truncated[0]:
+                return
+
+
+def _image(env: ForeignVectorEnv) -> NDArray[np.uint8]:
+    """What the environment draws; raises ConfigError if it is no RGB image."""
+    image = env.render()[0]
+    is_image = isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.shape[2:] == (3,) and image.size
+    what = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else shown(image)
+    require(bool(is_image), f"env_id {env.env_id!r}: render() gave {what}, no RGB image [height, width, 3] uint8")
+    drawn: NDArray[np.uint8] = image
+    return drawn
 
 
 def _state_of(worlds: WorldBatch) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 from safetensors import SafetensorError
@@ -94,7 +95,7 @@ class RolloutNode:
         shards: Sequence[Handle[PushTarget]],
         pushes_in_flight: int,
     ) -> None:
-        self._worker = RolloutWorker(settings, worker_id, incarnation)
+        self._origin = settings, worker_id, incarnation
         self._calls = calls
         self._shards = list(shards)
         self._shard_incarnations = [0] * len(shards)
@@ -103,6 +104,14 @@ class RolloutNode:
         self._writer = FragmentWriter()
         self._pushes: deque[_Push] = deque()
         self._watch = Stopwatch()
+
+    @cached_property
+    def _worker(self) -> RolloutWorker:
+        """Made in the first call that needs it: what is wrong with a user's environment comes out as that call's error.
+
+        Of an error while an actor is made, Ray would keep the text alone.
+        """
+        return RolloutWorker(*self._origin)
 
     def replace_shard(self, index: int, shard: Handle[PushTarget], incarnation: int) -> None:
         """Pushes to `shard`, of this incarnation, in place of the shard of this index."""

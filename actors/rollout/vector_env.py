@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from actors.rollout.foreign_env import ForeignVectorEnv, rehearse_env
 from actors.rollout.joined_env import JoinedVectorEnv
 from sim_core import ENV_ID
-from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 from sim_core.envs import SwarmVectorEnv
 from sim_core.worlds import rehearse
@@ -57,25 +56,18 @@ def make_vector_env(spec: EnvSpec, num_envs: int) -> gym.vector.VectorEnv[Any, A
     """Makes `num_envs` environments that restart in the step that ends an episode (`AutoresetMode.SAME_STEP`).
 
     Raises:
-      ConfigError: the id is unknown, its observations are no Box, or its actions are no Discrete that starts at 0.
+      ConfigError: see ForeignVectorEnv, which holds all environments that are not ours.
     """
-    try:
-        if spec.shares:
-            return JoinedVectorEnv(
-                [
-                    SwarmVectorEnv(count, **dataclasses.asdict(world))
-                    for (world, _), count in zip(spec.shares, _counts(spec, num_envs), strict=True)
-                ]
-            )
-        if spec.is_swarm:
-            env = gym.make_vec(ENV_ID, num_envs=num_envs, **spec.settings)
-        else:
-            mode = {"autoreset_mode": AutoresetMode.SAME_STEP}
-            env = gym.make_vec(spec.env_id, num_envs=num_envs, vectorization_mode="sync", vector_kwargs=mode)
-    except (gym.error.Error, ModuleNotFoundError) as error:
-        raise ConfigError(f"env_id {spec.env_id!r} cannot be made by Gymnasium: {error}") from error
-    _check_spaces(env, spec.env_id)
-    return env
+    if spec.shares:
+        return JoinedVectorEnv(
+            [
+                SwarmVectorEnv(count, **dataclasses.asdict(world))
+                for (world, _), count in zip(spec.shares, _counts(spec, num_envs), strict=True)
+            ]
+        )
+    if spec.is_swarm:
+        return gym.make_vec(ENV_ID, num_envs=num_envs, **spec.settings)
+    return ForeignVectorEnv(spec.env_id, num_envs)
 
 
 def _counts(spec: EnvSpec, num_envs: int) -> list[int]:
@@ -101,14 +93,6 @@ def spaces_of(env: gym.vector.VectorEnv[Any, Any, Any]) -> EnvShape:
     return EnvShape(space, int(actions.n))
 
 
-def _check_spaces(env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> None:
-    if not isinstance(env.single_observation_space, gym.spaces.Box):
-        raise ConfigError(f"env_id {env_id!r} must have Box observations, not {env.single_observation_space}")
-    action_space = env.single_action_space
-    if not isinstance(action_space, gym.spaces.Discrete) or action_space.start != 0:
-        raise ConfigError(f"env_id {env_id!r} must have Discrete actions from 0, not {action_space}")
-
-
 class EnvShape(NamedTuple):
     """Spaces of one environment, as the network and the replay need them."""
 
@@ -122,11 +106,13 @@ class EnvShape(NamedTuple):
 
 
 def env_shape(spec: EnvSpec) -> EnvShape:
-    """Spaces of `spec`, read from one environment that is made for this; a user's method or scene is rehearsed first.
+    """Spaces of `spec`, read from one environment that is made for this; whatever is a user's own is rehearsed first.
 
     Raises:
       ConfigError: see `make_vector_env`; also if the rehearsal finds an error in the user's code.
     """
+    if not spec.is_swarm:
+        rehearse_env(spec.env_id)
     for world in spec.worlds if spec.is_swarm else []:
         rehearse(world)
     env = make_vector_env(spec, len(spec.worlds))
@@ -150,7 +136,5 @@ def final_observations(observation: NDArray[Any], done: NDArray[np.bool_], infos
     if not done.any():
         return observation
     next_observation = observation.copy()
-    final = infos["final_obs"][done]
-    is_array = final.dtype == observation.dtype  # Gymnasium's own vector environments give an array of objects
-    next_observation[done] = final if is_array else np.stack(list(final))
+    next_observation[done] = infos["final_obs"][done]
     return next_observation

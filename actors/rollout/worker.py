@@ -21,6 +21,7 @@ from actors.service.messages import (
     transition_dtype,
 )
 from actors.service.packing import packed_dtype
+from sim_core.checks import ConfigError
 from sim_core.envs import SwarmVectorEnv
 
 
@@ -78,6 +79,7 @@ class RolloutWorker:
 
         Raises:
           RuntimeError: no weights have been set.
+          ConfigError: a return is not finite, or a user's own code does what it must not.
         """
         if self._policy is None:
             raise RuntimeError("a rollout worker needs weights before it collects")
@@ -89,6 +91,8 @@ class RolloutWorker:
         for i in range(count):
             self._step(self._policy, random_actions[i], steps, ended, i)
         packed = self._nstep.push(steps)
+        if not np.isfinite(packed.rows["reward"]).all():
+            raise ConfigError(self._too_large(packed.rows["reward"]))
         self._made += len(packed.rows)
         weights = self._policy.weights
         header = BlockHeader(
@@ -104,6 +108,13 @@ class RolloutWorker:
         )
         self._sequence += 1
         return TransitionBlock(header, packed, select_stats(ended, steps.done))
+
+    def _too_large(self, reward: NDArray[np.float32]) -> str:
+        env, bad = self._settings.env, reward[~np.isfinite(reward)][0]
+        cause = f"reward_scale {env.world.reward_scale:g}" if env.is_swarm else f"the rewards of env_id {env.env_id!r}"
+        return (
+            f"{cause} makes a {self._settings.n_step}-step return of {bad}, which no float32 holds; scale rewards down"
+        )
 
     def _step(
         self, policy: Policy, random_actions: NDArray[np.int64], steps: Steps, ended: EpisodeStats, i: int

@@ -11,11 +11,14 @@ from enum import StrEnum
 from typing import NamedTuple
 
 MAX_ATTEMPTS = 5
-"""Consecutive failures, with no successful call in between, that a run outlives; the next one ends it."""
+"""Consecutive failures that a run outlives; the next one ends it."""
 MAX_RETRIES = 2
 """Consecutive failures after which an unreachable component is replaced instead of retried."""
+STEADY_CALLS = 1_000
+"""Calls that a component of a run with a foreign environment makes before its failures are forgotten: an environment
+that ends its process after a while would else have it restarted for ever."""
 GIVE_UP_S = 3_600.0
-"""Seconds since the first of consecutive failures after which the run gives up on a component."""
+"""Seconds of failures without a successful call in between after which the run gives up on a component."""
 
 
 class ComponentKind(StrEnum):
@@ -115,6 +118,10 @@ class RunFailed(RuntimeError):
     """A component keeps failing and the run cannot continue; the message names the component and the fault."""
 
 
+class Diverged(RunFailed):
+    """Numbers of the learner are no longer finite; the message says which."""
+
+
 _REPLACEMENT = {
     ComponentKind.WORKER: Action.RESTART,
     ComponentKind.SHARD: Action.RESTART,
@@ -172,25 +179,37 @@ class _Streak(NamedTuple):
     attempts: int
     fault: Fault
     action: Action
+    calls: int = 0
+    """Successful calls since the last failure."""
 
 
 class FaultTracker:
-    """Counts each component's consecutive failures and decides how to react to the next one."""
+    """Counts each component's consecutive failures and decides how to react to the next one.
 
-    def __init__(self) -> None:
+    Args:
+      steady_calls: successful calls in a row that end a streak of failures.
+    """
+
+    def __init__(self, steady_calls: int = 1) -> None:
+        self._steady_calls = steady_calls
         self._streaks: dict[Component, _Streak] = {}
 
     def record_failure(self, failure: ComponentFailed, now_s: float) -> Decision:
         """Counts a failure at time `now_s` and decides about it."""
         before = self._streaks.get(failure.component)
-        since_s, attempts = (before.since_s, before.attempts + 1) if before else (now_s, 1)
+        since_s = before.since_s if before and not before.calls else now_s
+        attempts = before.attempts + 1 if before else 1
         action = decide(failure.component.kind, failure.fault, attempts, now_s - since_s)
         self._streaks[failure.component] = _Streak(since_s, attempts, failure.fault, action)
         return Decision(action, attempts)
 
     def record_success(self, component: Component, now_s: float) -> Recovered | None:
-        """Ends the component's streak of failures at time `now_s`; returns None if there was none."""
+        """Counts a successful call at time `now_s`; returns None unless it is the first one after a failure."""
         streak = self._streaks.pop(component, None)
         if streak is None:
+            return None
+        if streak.calls + 1 < self._steady_calls:
+            self._streaks[component] = streak._replace(calls=streak.calls + 1)
+        if streak.calls:
             return None
         return Recovered(component, streak.fault, streak.action, streak.attempts, now_s - streak.since_s)

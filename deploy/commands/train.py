@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 
 from actors.policy.baselines import Baseline
-from actors.rollout.vector_env import env_shape
 from deploy.console.terminal import plain_console
 from deploy.options.training import Launch, Train
 from deploy.runs.folders import (
@@ -16,7 +15,14 @@ from deploy.runs.folders import (
     new_storage,
     run_location,
 )
-from deploy.training import check_device, open_tracker, print_resume_point, resume_training, run_training
+from deploy.training import (
+    check_device,
+    check_environment,
+    open_tracker,
+    print_resume_point,
+    resume_training,
+    run_training,
+)
 from learner.checkpoints.checkpoint import finished_names
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig, config_hash
@@ -48,10 +54,9 @@ def run(command: Train) -> int:
             _check_storage(folder, command.checkpoint_url)
             return _resume(folder, config, launch.cluster_options())
     make_folder(launch.runs_dir, "--runs-dir")
+    check_environment(folder, config, launch.deadline_s)
     if launch.ray_address() is None:
         check_fits(config)
-    else:
-        env_shape(config.env)  # raises if the environment cannot be made
     check_device(config, launch.ray_address())
     storage = new_storage(command.checkpoint_url, folder.path.name, command.keep_best)
     tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())

@@ -42,8 +42,7 @@ def run(command: Watch) -> int:
         _render_swarm(config, weights, command, path)
     else:
         require(command.format == "mp4", f"{config.env_id} can only be watched as a video; use --format mp4")
-        made = foreign_animation(config, weights, command.seed, path)
-        require(bool(made), f"{config.env_id} cannot be rendered to images (no rgb_array mode)")
+        foreign_animation(config, weights, command.seed, path)
     plain_console().print(str(path), soft_wrap=True)
     return 0
 

@@ -30,7 +30,8 @@ class RayOptions:
     address: str | None = None
     """Ray cluster to join; RAY_ADDRESS by default, else a Ray on this machine."""
     deadline_s: float = DEADLINE_S
-    """Seconds of silence after which a component that owes an answer is replaced (Ray only)."""
+    """Seconds of silence after which a component that owes an answer is replaced; in one process, longest
+    time of one step of a user's environment."""
     start_deadline_s: float = START_DEADLINE_S
     """The same for a component that is starting or being restored."""
     spares: int = 0

@@ -10,6 +10,7 @@ from actors.evaluation.evaluator import record_episode, record_frames
 from actors.evaluation.trajectory import Episode, load_episodes, save_episodes
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import env_shape
+from actors.service.fault_policy import first_line
 from actors.storage.atomic_write import replacing_file
 from dashboards.figures.learning_curve import learning_curve_png
 from dashboards.figures.video import check_video_packages, episode_frames, write_mp4
@@ -49,7 +50,8 @@ def log_artifacts(
         path = folder.artifacts / "episode.mp4"
         try:
             check_video_packages()
-            written += foreign_animation(config, result.weights, config.final_eval_first_seed, path)
+            foreign_animation(config, result.weights, config.final_eval_first_seed, path)
+            written.append(path)
         except ConfigError as error:
             message(f"no animation: {error}")
     if result.by_setup:
@@ -113,10 +115,14 @@ def write_video(store: Path, path: Path) -> None:
     write_mp4(episode_frames(episodes[0], world, VIDEO_SIZE_PX), path, 1 / world.time_step_s)
 
 
-def foreign_animation(config: RunConfig, weights: WeightsSnapshot, seed: int, path: Path) -> list[Path]:
-    """Writes one episode of a Gymnasium environment as MP4; returns the file, or none if it cannot be rendered."""
+def foreign_animation(config: RunConfig, weights: WeightsSnapshot, seed: int, path: Path) -> None:
+    """Writes one episode of a Gymnasium environment as MP4.
+
+    Raises:
+      ConfigError: it cannot be drawn, or its images cannot be encoded.
+    """
     frames, frames_per_s = record_frames(config.env, weights, seed)
-    if not frames:
-        return []
-    write_mp4(frames, path, frames_per_s)
-    return [path]
+    try:
+        write_mp4(frames, path, frames_per_s)
+    except OSError as error:
+        raise ConfigError(f"the images of env_id {config.env_id!r} cannot be encoded: {first_line(error)}") from error

@@ -23,7 +23,7 @@ from ray.exceptions import (
     WorkerCrashedError,
 )
 
-from actors.service.fault_policy import CallFailed, ComponentFailed, Fault, first_line
+from actors.service.fault_policy import CallFailed, ComponentFailed, Fault, RunFailed, first_line
 from actors.service.rpc import Handle, Ref
 from sim_core.checks import ConfigError
 
@@ -49,7 +49,7 @@ def _as_fault(error: Exception) -> Exception:
     """The fault that an error of Ray stands for; an error that our own code raised, unchanged."""
     if isinstance(error, RayTaskError):
         cause = getattr(error, "cause", None)
-        if isinstance(cause, CallFailed | ComponentFailed | ConfigError):  # ConfigError: of a user's own method
+        if isinstance(cause, CallFailed | ComponentFailed | RunFailed | ConfigError):  # ConfigError: of a user's code
             return cause
         return _as_fault(cause) if isinstance(cause, RayError) else error
     for kinds, fault in FAULTS:

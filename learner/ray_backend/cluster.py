@@ -20,7 +20,8 @@ from ray.exceptions import AuthenticationError
 from actors.evaluation.evaluator import Candidate, evaluate_in_parallel
 from actors.replay.node import ShardNode
 from actors.rollout.node import RolloutNode
-from actors.rollout.vector_env import EnvSpec, env_shape
+from actors.rollout.vector_env import EnvShape, EnvSpec, env_shape
+from actors.service.fault_policy import CallFailed, RunFailed
 from actors.service.messages import EpisodeStats
 from actors.service.rpc import Handle, LocalCalls, Ref, by_reference, local_handle
 from learner.cluster_options import DEADLINE_S, ClusterOptions
@@ -72,12 +73,12 @@ class LearnerActor(LearnerNode):
 
     Args:
       config: the run.
+      shape: spaces of its environment, which is not made in this process.
       shards: actors of the shards, or none.
       calls: how to call them.
     """
 
-    def __init__(self, config: RunConfig, shards: list[Handle[ShardNode]], calls: RayCalls) -> None:
-        shape = env_shape(config.env)
+    def __init__(self, config: RunConfig, shape: EnvShape, shards: list[Handle[ShardNode]], calls: RayCalls) -> None:
         if shards:
             super().__init__(config, shape, shards, calls, prefetch=config.replay == "uniform")
         else:
@@ -173,16 +174,21 @@ def leave() -> None:
 def evaluate_in_tasks(
     specs: list[EnvSpec], candidate: Candidate, seeds: list[int], address: str | None
 ) -> list[EpisodeStats]:
-    """Plays one episode per environment and seed in Ray tasks on all CPUs (see `connect` for errors).
+    """Plays one episode per environment and seed in Ray tasks on all CPUs (see `connect` for further errors).
 
     Returns:
       For each environment one entry per seed, in order.
+
+    Raises:
+      RunFailed: a task fails again and again.
     """
     connect(1, address)
     calls = RayCalls(DEADLINE_S)
     try:
         who, cpus = calls.put(candidate), cluster_cpus()
         return [evaluate_in_parallel(calls, spec, who, seeds, cpus) for spec in specs]
+    except CallFailed as failure:
+        raise RunFailed(f"the evaluation {failure.fault} again and again: {failure.reason}") from failure
     finally:
         leave()
 
@@ -219,7 +225,8 @@ class RayCluster(Cluster):
 
     def place_learner(self) -> Handle[LearnerNode]:
         """Starts the learner's actor, which embeds the shards if they have no actors of their own."""
-        return _start_actor(LearnerActor, learner_gpus(self.config), self.config, self.shards, self._node_calls)
+        arguments = (self.config, self._shape, self.shards, self._node_calls)
+        return _start_actor(LearnerActor, learner_gpus(self.config), *arguments)
 
     def place_worker(self, worker_id: int, incarnation: int) -> Handle[RolloutNode]:
         """Starts the actor of a rollout worker, or makes a spare one."""

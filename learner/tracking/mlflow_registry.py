@@ -24,18 +24,20 @@ from learner.config import RunConfig, config_hash
 
 BEST = "best"
 """Alias of the version with the highest score."""
+MAX_NAME = 200
+"""Most characters of a registered model's name; MLflow's database takes 256."""
 SCORE = "score"
 """Tag of a version: success rate of the run's final evaluation; mean return where episodes have no outcome."""
 
 
 def model_name(config: RunConfig) -> str:
-    """Name of the registered model for a run's setup; MLflow refuses `/` and `:`, which Gymnasium's ids may have."""
+    """Name of the registered model for a run's setup; MLflow takes neither all characters nor all lengths of an id."""
     world = config.world
     if len(config.env.worlds) > 1:
         return f"{world.method_name}-{len(config.env.worlds)}-setups"
     if config.env.is_swarm:
         return f"{world.method_name}-{world.robots}r-{world.groups}g"
-    return re.sub(r"[/:]", "-", config.env_id)
+    return re.sub(r"[^\w.-]", "-", config.env_id)[-MAX_NAME:]
 
 
 def register_policy(client: MlflowClient, config: RunConfig, run_id: str, logged: ModelInfo, score: float) -> None:

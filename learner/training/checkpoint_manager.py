@@ -75,6 +75,11 @@ class CheckpointManager:
         return self._saved if self._saved_at == (self._progress.env_steps, self._progress.updates) else None
 
     @property
+    def newest(self) -> Location | None:
+        """The newest checkpoint that this session has written or restored; None if there is none."""
+        return self._saved
+
+    @property
     def may_begin(self) -> bool:
         """Whether a checkpoint is wanted, and none is being written."""
         return self.is_wanted and not self._writer.is_busy

@@ -203,10 +203,18 @@ class Supervisor:
         decision = self._faults.record_failure(failure, time.monotonic())
         self._observer.failed(failure, decision)
         if decision.action is Action.STOP:
-            raise RunFailed(f"{failure}, {decision.attempts} times in a row; fix the cause, then go on with resume")
+            suspect = self._suspect(failure.component)
+            times = f"{decision.attempts} times in a row"
+            raise RunFailed(f"{failure}, {times}{suspect}; fix the cause, then go on with resume")
         if decision.action is Action.REBUILD:
             raise RunLost(failure, self.highest)
         return decision.action
+
+    def _suspect(self, component: Component) -> str:
+        """Names the environment where it is a user's own and runs in the component's process."""
+        env = self._cluster.config.env
+        plays = component.kind in (ComponentKind.WORKER, ComponentKind.EVALUATOR)
+        return f"; env_id {env.env_id!r} may end its process, or not come back" if plays and not env.is_swarm else ""
 
     def recover(self, failure: ComponentFailed) -> Delivered:
         """Retries or restarts the failed component; does nothing if it has been replaced since.

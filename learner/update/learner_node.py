@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -17,7 +18,7 @@ from actors.policy.baselines import Baseline, MethodRule
 from actors.policy.policy import WeightsSnapshot
 from actors.replay.node import ShardNode
 from actors.rollout.vector_env import EnvShape
-from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind
+from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, Diverged
 from actors.service.messages import STORES, WAITS, AddReply, Delivered, Draws, TransitionBlock
 from actors.service.rpc import Calls, Handle, Ref
 from actors.service.stopwatch import Stopwatch
@@ -147,6 +148,7 @@ class LearnerNode:
 
         Raises:
           ComponentFailed: a shard failed, and no update was made.
+          Diverged: the loss or a weight is no longer finite; the weights are not published.
         """
         self._watch.lap(WAITS)
         count = updates * self._batch_size
@@ -158,6 +160,7 @@ class LearnerNode:
         if self._teacher is not None:
             sample.columns["teacher_weight"] = np.full(count, teacher_weight, np.float32)
         stats = self._learner.update(sample.columns, learning_rate, weights)
+        self._check_finite(stats)
         self._watch.lap(UPDATES)
         if sample.draws is not None:
             self._update_priorities(sample)
@@ -168,10 +171,26 @@ class LearnerNode:
         return UpdateReport(stats, self._learner.updates, self._watch.take())
 
     def publish(self) -> None:
-        """Sends the newest weights to all shards, whose replies to pushes carry them on to the rollout workers."""
-        self._weights = self._learner.weights(time.time())
+        """Sends the newest weights to all shards, whose replies to pushes carry them on to the rollout workers.
+
+        Raises:
+          Diverged: a weight is not finite.
+        """
+        weights = self._learner.weights(time.time())
+        if not all(np.isfinite(array).all() for array in weights.arrays):
+            raise self._diverged("a weight is not finite")
+        self._weights = weights
         for shard in self._shards:
             self._calls.start(shard, ShardNode.publish, self._weights)
+
+    def _check_finite(self, stats: UpdateStats) -> None:
+        """Raises Diverged if a mean over the updates is not finite; looking at them costs nothing."""
+        for name, value in stats._asdict().items():
+            if not math.isfinite(value):
+                raise self._diverged(f"{name} is {value}")
+
+    def _diverged(self, what: str) -> Diverged:
+        return Diverged(f"{what} after {self._learner.updates:,} updates")
 
     def _draw(self, count: int) -> Sample:
         """Draws `count` rows (see `_sample`), augments them, and asks the teacher what it would have done."""
@@ -234,9 +253,13 @@ class LearnerNode:
 
         Raises:
           ComponentFailed: a shard failed.
+          Diverged: a number of networks or optimiser is not finite; nothing is written.
         """
         self._await_priority_updates()
         tensors = self._learner.get_state()
+        for name, tensor in tensors.items():
+            if not torch.isfinite(tensor).all():
+                raise self._diverged(f"{name} is not finite")
         self._writer.start(join_location(location, WEIGHTS), lambda path: path.write_bytes(to_bytes(tensors)))
         refs = [
             self._calls.start(shard, ShardNode.save, _shard_folder(location, i)) for i, shard in enumerate(self._shards)

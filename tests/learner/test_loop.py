@@ -4,12 +4,17 @@ import dataclasses
 from collections import Counter
 from contextlib import closing
 
+import numpy as np
 import pytest
+from safetensors.numpy import load_file
 
 from actors.rollout.node import RolloutNode
+from actors.service.fault_policy import Diverged
+from learner.checkpoints.checkpoint import newest_valid
 from learner.loop import TrainingLoop
 from learner.tracking.journal import Journal
 from learner.training.cluster import ProcessCluster, rollout_settings
+from learner.update.learner_node import WEIGHTS, LearnerNode
 from tests.checkpointing import Silent
 from tests.learner.failing_calls import FailingCalls
 
@@ -65,3 +70,38 @@ def test_a_checkpoint_waits_for_one_call_of_each_component(small_run, tmp_path, 
         assert loop.run()
     assert max(rounds) == 2  # else nothing was held back
     assert len(begun) >= 5 and max(begun) == 1
+
+
+def test_a_run_that_diverges_keeps_its_last_finite_checkpoint_and_names_it(small_run, tmp_path):
+    """The learning rate is sane for two checkpoints, and then is not."""
+    block = small_run.block_env_steps
+    config = dataclasses.replace(
+        small_run, total_env_steps=100 * block, checkpoint_every_env_steps=10 * block, min_replay=block
+    )
+    with closing(Journal(tmp_path / "m.jsonl", 0)) as journal:
+        cluster = ProcessCluster(config, 0)
+        loop = TrainingLoop(config, cluster, journal, tmp_path / "checkpoints", Silent(), bool)
+        update = LearnerNode.update
+
+        def step_too_far(node, updates, learning_rate, *more):
+            return update(node, updates, learning_rate if loop.env_steps < 25 * block else 1e30, *more)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(LearnerNode, "update", step_too_far)
+            step_too_far.__name__ = "update"
+            with pytest.raises(Diverged, match="the training has diverged: .* updates, at env step") as caught:
+                loop.run()
+    checkpoint, skipped = newest_valid(tmp_path / "checkpoints")
+    assert not skipped and f"the last checkpoint, {checkpoint.folder}, has finite numbers" in str(caught.value)
+    assert 10 * block <= checkpoint.state["env_steps"] <= 30 * block
+    assert f"at env step {loop.env_steps:,};" in str(caught.value)
+    tensors = load_file(checkpoint.folder / WEIGHTS)
+    assert tensors and all(np.isfinite(tensor).all() for tensor in tensors.values())
+
+
+def test_a_run_that_diverges_at_once_says_that_it_has_no_checkpoint(small_run, tmp_path):
+    config = dataclasses.replace(small_run, learning_rate=1e30, learning_rate_end=1e30)
+    with closing(Journal(tmp_path / "m.jsonl", 0)) as journal:
+        loop = TrainingLoop(config, ProcessCluster(config, 0), journal, tmp_path / "checkpoints", Silent(), bool)
+        with pytest.raises(Diverged, match="no checkpoint has finite numbers"):
+            loop.run()

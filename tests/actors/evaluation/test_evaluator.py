@@ -10,6 +10,7 @@ from actors.evaluation import evaluator
 from actors.evaluation.evaluator import evaluate, evaluate_in_parallel, record_episode, record_frames
 from actors.policy.baselines import PILOTS, Baseline
 from actors.policy.policy import Policy
+from actors.rollout.foreign_env import EnvError
 from actors.rollout.vector_env import EnvSpec
 from actors.service.messages import NO_OUTCOME
 from actors.service.rpc import LocalCalls
@@ -173,19 +174,49 @@ def test_a_recorded_episode_holds_every_state(swarm, make_weights):
     assert 0 <= episode.learner < swarm.world.num_robots
 
 
-def test_an_environment_without_images_gives_no_frames(monkeypatch, cart_pole, make_weights):
-    def no_images(env_id, render_mode):
-        raise gym.error.UnsupportedMode(render_mode)
+NO_PICTURE = {
+    "Plain": "has no render mode rgb_array; it has \\[\\]",
+    "TakesNoMode": "cannot be made by Gymnasium: TypeError",
+    "CannotRender": "render\\(\\) raised NotImplementedError",
+    "DrawsNothing": "render\\(\\) gave None, no RGB image",
+    "DrawsText": "render\\(\\) gave 'A robot.', no RGB image",
+    "DrawsGrey": "render\\(\\) gave uint8 \\(32, 48\\), no RGB image",
+    "DrawsSizes": "render\\(\\) gave images of several sizes",
+}
 
-    monkeypatch.setattr(gym, "make", no_images)
-    assert record_frames(cart_pole, make_weights(cart_pole), 1) == ([], 0.0)
+
+@pytest.mark.parametrize("name", NO_PICTURE)
+def test_an_environment_that_cannot_be_drawn_is_refused(name, make_weights):
+    spec = EnvSpec(f"tests.odd_envs:{name}-v0", WorldConfig())
+    with pytest.raises(ConfigError, match=NO_PICTURE[name]):
+        list(record_frames(spec, make_weights(spec), 1)[0])
+
+
+def test_images_are_those_of_the_steps(make_weights):
+    spec = EnvSpec("tests.odd_envs:Images-v0", WorldConfig())
+    frames, frames_per_s = record_frames(spec, make_weights(spec), 1)
+    assert [frame.max() for frame in frames] == [10 * step for step in range(20)] and frames_per_s == 20
+
+
+def test_an_episode_that_never_ends_is_refused(monkeypatch, make_weights):
+    monkeypatch.setattr(evaluator, "MAX_EPISODE_STEPS", 50)
+    spec = EnvSpec("tests.odd_envs:NeverEnds-v0", WorldConfig())
+    with pytest.raises(EnvError, match="has not ended after 50 steps; give the environment a time limit"):
+        evaluate(spec, make_weights(spec), [1])
+
+
+def test_the_outcome_of_another_environment_is_its_own(make_weights):
+    spec = EnvSpec("tests.odd_envs:OwnOutcome-v0", WorldConfig())
+    stats = evaluate(spec, make_weights(spec), [1, 2])
+    assert stats.outcome.tolist() == [NO_OUTCOME] * 2 and stats.length_steps.tolist() == [20] * 2
 
 
 @pytest.mark.parametrize(("name", "rate"), [("cart_pole", 50), ("swarm", 20)])
 def test_recorded_frames_have_one_image_per_step(name, rate, request, make_weights):
     spec = request.getfixturevalue(name)
     weights = make_weights(spec)
-    frames, frames_per_s = record_frames(spec, weights, 4)
+    drawn, frames_per_s = record_frames(spec, weights, 4)
+    frames = list(drawn)
     if not spec.is_swarm:  # gym.make ignores the spec's world
         assert len(frames) == evaluate(spec, weights, [4]).length_steps[0]
     assert frames_per_s == rate

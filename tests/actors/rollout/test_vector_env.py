@@ -100,8 +100,7 @@ BOX, DISCRETE = gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(2)
 @pytest.mark.parametrize(
     ("observation", "action", "words"),
     [
-        (gym.spaces.Dict({"a": BOX}), DISCRETE, "Box observations"),
-        (DISCRETE, DISCRETE, "Box observations"),
+        (gym.spaces.Sequence(BOX), DISCRETE, "cannot be flattened to a Box"),
         (BOX, gym.spaces.MultiDiscrete([2, 2]), "Discrete actions"),
         (BOX, gym.spaces.Discrete(3, start=1), "Discrete actions from 0"),
     ],

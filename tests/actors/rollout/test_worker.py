@@ -1,5 +1,6 @@
 """A rollout worker against environments that the test steps with the same actions."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -9,6 +10,7 @@ from actors.policy.policy import Policy
 from actors.rollout.vector_env import env_shape
 from actors.rollout.worker import RolloutSettings, RolloutWorker, join_stats
 from actors.service.messages import NO_OUTCOME, SCHEMA_VERSION, EpisodeStats, transition_dtype
+from sim_core.checks import ConfigError
 from sim_core.envs import SwarmVectorEnv
 from sim_core.outcomes import ENDED
 from tests.packed import unpack
@@ -175,3 +177,11 @@ def test_join_stats():
     joined = join_stats([one, two])
     assert [column.tolist() for column in joined] == [[1, 2, 5], [3, 4, 9], [0.5, 1.5, -1.0]]
     assert [len(column) for column in join_stats([])] == [0, 0, 0]
+
+
+def test_a_return_that_float32_does_not_hold_never_leaves_the_worker(swarm, make_worker):
+    spec = swarm._replace(world=dataclasses.replace(swarm.world, reward_scale=3e38))
+    worker = make_worker(spec, n_step=3)
+    with pytest.raises(ConfigError, match="reward_scale 3e.38 makes a 3-step return of -?inf"):
+        for _ in range(20):
+            worker.collect(1.0)

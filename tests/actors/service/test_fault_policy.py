@@ -86,6 +86,28 @@ def test_consecutive_failures_count_until_a_success():
     assert tracker.record_failure(failure(WORKER), 12.0).attempts == 1
 
 
+def test_with_steady_calls_failures_are_forgotten_only_after_as_many():
+    tracker = FaultTracker(steady_calls=3)
+    for attempt in range(1, MAX_ATTEMPTS + 1):
+        assert tracker.record_failure(failure(WORKER), 10.0 * attempt).attempts == attempt
+        recovered = tracker.record_success(WORKER, 10.0 * attempt + 1)
+        assert recovered is not None and (recovered.attempts, recovered.seconds) == (attempt, 1.0)
+        assert tracker.record_success(WORKER, 10.0 * attempt + 2) is None
+    assert tracker.record_failure(failure(WORKER), 90.0).action is Action.STOP
+    tracker = FaultTracker(steady_calls=3)
+    tracker.record_failure(failure(WORKER), 0.0)
+    for second in range(3):
+        tracker.record_success(WORKER, second)
+    assert tracker.record_failure(failure(WORKER), 9.0).attempts == 1
+
+
+def test_a_success_restarts_the_clock_of_failures():
+    tracker = FaultTracker(steady_calls=10)
+    tracker.record_failure(failure(WORKER), 0.0)
+    tracker.record_success(WORKER, 1.0)
+    assert tracker.record_failure(failure(WORKER), 2 * GIVE_UP_S).action is Action.RESTART
+
+
 def test_failures_are_counted_per_component():
     tracker = FaultTracker()
     for _ in range(MAX_ATTEMPTS):

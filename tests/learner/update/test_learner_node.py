@@ -12,6 +12,7 @@ from actors.replay.node import ShardNode, ShardSettings
 from actors.replay.prioritised import PRIORITY_EPSILON, PrioritySettings
 from actors.rollout.vector_env import env_shape
 from actors.rollout.worker import join_stats
+from actors.service.fault_policy import Diverged
 from actors.service.messages import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
 from actors.service.rpc import Done, LocalCalls
 from actors.service.stopwatch import Stopwatch
@@ -412,5 +413,34 @@ def test_divergence_ends_the_run(make_learner, make_rows):
     rows = make_rows(50)
     rows["reward"] = np.inf
     shard.add(make_block(rows))
-    with pytest.raises(ValueError, match="diverged"):
+    with pytest.raises(Diverged, match="loss is inf after 1 updates"):
         learner.update(1, RATE, 1.0)
+
+
+@pytest.mark.parametrize("settings", [{}, {"gradients": "autograd"}, {"loss": "mse"}, {"policy_average_updates": 10}])
+def test_weights_that_are_not_finite_are_neither_published_nor_saved(make_learner, make_rows, tmp_path, settings):
+    learner, shards = make_learner(**settings)
+    learner.add(make_block(make_rows(30)))
+    for _ in range(3):
+        learner.update(1, RATE)
+    published = learner.weights()
+    with pytest.raises(Diverged, match=r"(loss|td_error|q_mean) is (nan|-?inf)|a weight is not finite"):
+        for _ in range(20):
+            learner.update(1, 1e30)
+            published = learner.weights()
+    assert learner.weights() is published and all(np.isfinite(array).all() for array in published.arrays)
+    reply = learner.add(make_block(make_rows(5), sequence=1))
+    assert reply.weights_version == published.version
+    with pytest.raises(Diverged, match="is not finite after"):
+        learner.save(tmp_path / "c")
+    assert not (tmp_path / "c").exists()
+
+
+def test_moments_that_are_not_finite_are_not_saved(make_learner, make_rows, tmp_path):
+    learner, _ = make_learner()
+    learner.add(make_block(make_rows(30)))
+    learner.update(1, RATE)
+    state = learner._learner.optimiser.state[learner._learner._online.values]
+    state["exp_avg_sq"][0] = np.inf
+    with pytest.raises(Diverged, match="optimiser.exp_avg_sq is not finite after 1 updates"):
+        learner.save(tmp_path / "c")

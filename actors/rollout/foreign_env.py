@@ -1,0 +1,288 @@
+"""Any Gymnasium environment that is not ours, as a vector environment that checks all that it returns.
+
+This is the one boundary to code that is not ours. Behind it every observation has the shape and dtype of its space,
+every observation and reward is a finite number that float32 holds, and every flag is a truth value. Whatever an
+environment does instead, and whatever it raises, becomes an EnvError: one sentence with its id, the step and the value.
+Infos are the environment's own and stay there.
+"""
+
+from __future__ import annotations
+
+import functools
+import traceback
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from actors.rollout.foreign_spaces import Unfit, flat_space, make_encoder, shown
+from sim_core.checks import ConfigError
+from sim_core.plugins import reason_of
+
+MAX_FLOAT32 = float(np.finfo(np.float32).max)
+"""Greatest number that the replay and the network can hold."""
+REHEARSAL_STEPS = 20
+OUTSIDE = tuple(str(Path(module).parent) for module in (gym.__file__, np.__file__, __file__))
+"""Folders of code that is not the environment's."""
+
+
+class EnvError(ConfigError):
+    """A foreign environment does what it must not; the message names its id, the step and the value.
+
+    Args:
+      message: one sentence.
+      trace: the traceback of what it raised; empty if it raised nothing.
+    """
+
+    def __init__(self, message: str, trace: str = "") -> None:
+        super().__init__(message)
+        self.trace = trace
+
+
+class EnvInterrupted(BaseException):
+    """Ends a call of an environment that takes too long; user code that catches `Exception` lets it through."""
+
+
+class ForeignVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArray[Any]]):
+    """Environments of one Gymnasium id, one after the other; each restarts in the step that ends its episode.
+
+    Args:
+      env_id: the id.
+      num_envs: how many environments.
+      render_mode: of all of them; None draws nothing.
+
+    Attributes:
+      envs: the environments.
+      steps: that each of them has made.
+
+    Raises:
+      EnvError: the id is unknown, the environment cannot be made, or its spaces are none that a run can have.
+    """
+
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(self, env_id: str, num_envs: int, render_mode: str | None = None) -> None:
+        self.env_id, self.num_envs, self.render_mode = env_id, num_envs, render_mode
+        self.steps = 0
+        self.envs: list[gym.Env[Any, Any]] = []
+        for _ in range(num_envs):
+            self.envs.append(self._make())
+        (space, actions), *others = map(self._spaces_of, self.envs)
+        if not isinstance(actions, gym.spaces.Discrete) or actions.start != 0:
+            raise self._refused(f"it must have Discrete actions from 0, not {shown(actions)}")
+        try:
+            self.single_observation_space = flat_space(space)
+        except Unfit as unfit:
+            raise self._refused(f"it has {unfit}") from None
+        if any(spaces != (space, actions) for spaces in others):
+            raise self._refused("it has other spaces each time that it is made")
+        self.metadata = self._metadata_of(self.envs[0]) | type(self).metadata
+        self._encode = make_encoder(space, self.single_observation_space)
+        self.single_action_space = actions
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(actions, num_envs)
+        self._shape = (num_envs, *np.shape(self.single_observation_space.low))
+        self._is_float = self.single_observation_space.dtype.kind == "f"
+
+    def _make(self) -> gym.Env[Any, Any]:
+        given: dict[str, Any] = {} if self.render_mode is None else {"render_mode": self.render_mode}
+        try:
+            return gym.make(self.env_id, disable_env_checker=True, **given)
+        except BaseException as error:
+            raise self._raised("make", error) from error
+
+    def _spaces_of(self, env: gym.Env[Any, Any]) -> tuple[Any, Any]:
+        try:
+            return getattr(env, "observation_space", None), getattr(env, "action_space", None)
+        except BaseException as error:
+            raise self._raised("observation_space or action_space", error) from error
+
+    def _metadata_of(self, env: gym.Env[Any, Any]) -> dict[str, Any]:
+        metadata = getattr(env, "metadata", None)
+        return metadata if isinstance(metadata, dict) else {}
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Starts an episode in every environment; environment i takes `seed[i]`.
+
+        Raises:
+          EnvError: see the module.
+        """
+        seeds = seed if isinstance(seed, list) else [seed] * self.num_envs
+        observation = self._empty()
+        for i, own in enumerate(seeds):
+            observation[i] = self._first_observation(i, seed=own, options=options)
+        self._check_finite(observation)
+        return observation, {}
+
+    def step(
+        self, actions: NDArray[np.int64]
+    ) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """One step of every environment; `actions` `[num_envs]`.
+
+        Where an episode ends, the observation is the next one's first; its own last is in `infos["final_obs"]`.
+
+        Raises:
+          EnvError: see the module.
+        """
+        self.steps += 1
+        observation, reward = self._empty(), np.empty(self.num_envs)
+        terminated, truncated = np.empty((2, self.num_envs), np.bool_)
+        infos: dict[str, Any] = {}
+        for i, (env, action) in enumerate(zip(self.envs, actions, strict=True)):
+            try:
+                result = env.step(action)
+            except BaseException as error:
+                raise self._raised("step", error) from error
+            if type(result) is not tuple or len(result) != 5 or not isinstance(result[4], dict):
+                raise self._refused(_what_step_gave(result))
+            row, gain, ended, cut, _ = cast("tuple[Any, ...]", result)
+            row = self._encoded("step", row)
+            reward[i] = gain if type(gain) is float else self._number(gain)
+            terminated[i] = ended = ended if type(ended) is bool else self._flag(ended)
+            truncated[i] = cut = cut if type(cut) is bool else self._flag(cut)
+            if ended or cut:
+                infos.setdefault("final_obs", self._empty())[i] = row
+                row = self._first_observation(i)
+            observation[i] = row
+        self._check_finite(observation, reward)
+        if infos:
+            infos["_final_obs"] = terminated | truncated
+            self._check_finite(infos["final_obs"][infos["_final_obs"]])
+        return observation, reward, terminated, truncated, infos
+
+    def render(self) -> tuple[Any, ...]:
+        """What every environment draws, unchecked.
+
+        Raises:
+          EnvError: one cannot draw.
+        """
+        try:
+            return tuple(env.render() for env in self.envs)
+        except BaseException as error:
+            raise self._raised("render", error) from error
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Closes every environment; what one raises then is of no use to anybody."""
+        for env in self.envs:
+            with suppress(Exception, SystemExit):
+                env.close()
+
+    def _empty(self) -> NDArray[Any]:
+        return np.zeros(self._shape, self.single_observation_space.dtype)
+
+    def _raised(self, doing: str, error: BaseException) -> BaseException:
+        """The error of a call that raised `error`; that itself, if it is not the environment's."""
+        if isinstance(error, (KeyboardInterrupt, ConfigError)):
+            return error
+        place = _place(error)
+        if isinstance(error, EnvInterrupted):
+            what = f"{doing}() has not come back{place} within {error}"
+        elif isinstance(error, SystemExit):
+            what = f"{doing}() ended the process with exit code {error.code}{place}"
+        elif doing == "make":
+            what = f"it cannot be made by Gymnasium: {reason_of(error)}{place}"
+        else:
+            what = f"{doing}() raised {reason_of(error)}{place}"
+        return self._refused(what, error)
+
+    def _first_observation(self, i: int, **kwargs: Any) -> NDArray[Any]:
+        try:
+            result: Any = self.envs[i].reset(**kwargs)
+        except BaseException as error:
+            raise self._raised("reset", error) from error
+        if type(result) is not tuple or len(result) != 2 or not isinstance(result[1], dict):
+            raise self._refused(f"reset() gave {shown(result)}, where Gymnasium has (observation, info)")
+        return self._encoded("reset", result[0])
+
+    def _encoded(self, doing: str, value: Any) -> NDArray[Any]:
+        try:
+            return self._encode(value)
+        except Unfit as unfit:
+            raise self._refused(f"{doing}() gave {unfit}") from None
+        except Exception as error:
+            what = f"{doing}() gave an observation that is no array: {reason_of(error)}"
+            raise self._refused(what, error) from error
+
+    def _number(self, value: Any) -> float:
+        if type(value) is float:
+            return value
+        array = _as_array(value)
+        if array is None or array.dtype.kind not in "biuf":
+            raise self._refused(f"step() gave the reward {shown(value)}, which is no number")
+        return float(array)
+
+    def _flag(self, value: Any) -> bool:
+        if type(value) is bool:
+            return value
+        array = _as_array(value)
+        if array is None or array.dtype.kind not in "biu" or array not in (0, 1):
+            raise self._refused(f"step() gave {shown(value)} where terminated and truncated must be True or False")
+        return bool(array)
+
+    def _check_finite(self, observation: NDArray[Any], reward: NDArray[np.float64] | None = None) -> None:
+        """Refuses numbers that are not finite in float32, in one pass over each array."""
+        if reward is not None and not np.abs(reward).max() <= MAX_FLOAT32:
+            raise self._refused(f"step() gave the reward {_first_bad(reward)}, which is not finite in float32")
+        if self._is_float and not np.abs(observation).max() <= MAX_FLOAT32:
+            raise self._refused(
+                f"it gave an observation with {_first_bad(observation)}, which is not finite in float32"
+            )
+
+    def _refused(self, what: str, error: BaseException | None = None) -> EnvError:
+        when = f" at its step {self.steps:,}" if self.steps else ""
+        return EnvError(f"env_id {self.env_id!r}{when}: {what}", "" if error is None else _trace(error))
+
+
+def _what_step_gave(result: Any) -> str:
+    if isinstance(result, tuple) and len(result) == 5:
+        return f"step() gave the info {shown(result[4])}, which is no dict"
+    what = f"{len(result)} values" if isinstance(result, tuple) else shown(result)
+    return f"step() gave {what}, where Gymnasium has (observation, reward, terminated, truncated, info)"
+
+
+def _trace(error: BaseException) -> str:
+    return "".join(traceback.format_exception(error))
+
+
+def _as_array(value: Any) -> NDArray[Any] | None:
+    """The one number that `value` is or holds, as an array without dimension; None if it is none."""
+    try:
+        array = np.asarray(value)
+        return array.reshape(()) if array.size == 1 else None
+    except Exception:  # whatever the value's own conversion raises
+        return None
+
+
+def _first_bad(values: NDArray[Any]) -> float:
+    return float(values[~(np.abs(values) <= MAX_FLOAT32)][0])
+
+
+def _place(error: BaseException) -> str:
+    """Where in the environment's code an error comes from, such as ` (my_env.py, line 12)`."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(OUTSIDE)]
+    return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+
+
+@functools.lru_cache(maxsize=64)
+def rehearse_env(env_id: str) -> None:
+    """Plays a few steps of an environment, so that what is wrong with it shows before anything else starts.
+
+    Raises:
+      EnvError: see the module.
+    """
+    env, rng = ForeignVectorEnv(env_id, 1), np.random.default_rng(0)
+    assert isinstance(env.single_action_space, gym.spaces.Discrete)
+    try:
+        env.reset(seed=[0])
+        for _ in range(REHEARSAL_STEPS):
+            env.step(rng.integers(env.single_action_space.n, size=1))
+        env.reset()
+    finally:
+        env.close()
