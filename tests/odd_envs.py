@@ -73,6 +73,13 @@ class HugeReward(Plain):
         return self.answer(reward=1e39)
 
 
+class LargeRewards(Plain):
+    """Each is finite, their sum is not."""
+
+    def good(self):
+        return self.answer(reward=3e38)
+
+
 class NanObservation(Plain):
     def bad(self):
         return self.answer(np.array([0, np.nan, 0], np.float32))

@@ -27,6 +27,7 @@ from sim_core.plugins import reason_of
 MAX_FLOAT32 = float(np.finfo(np.float32).max)
 """Greatest number that the replay and the network can hold."""
 REHEARSAL_STEPS = 20
+CANNOT_BE_MADE = "cannot be made by Gymnasium"
 OUTSIDE = tuple(str(Path(module).parent) for module in (gym.__file__, np.__file__, __file__))
 """Folders of code that is not the environment's."""
 
@@ -93,6 +94,8 @@ class ForeignVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDA
         given: dict[str, Any] = {} if self.render_mode is None else {"render_mode": self.render_mode}
         try:
             return gym.make(self.env_id, disable_env_checker=True, **given)
+        except (gym.error.Error, ModuleNotFoundError) as error:  # of a name rather than of the environment's code
+            raise EnvError(f"env_id {self.env_id!r} {CANNOT_BE_MADE}: {error}{_place(error)}") from error
         except BaseException as error:
             raise self._raised("make", error) from error
 
@@ -187,7 +190,7 @@ class ForeignVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDA
         elif isinstance(error, SystemExit):
             what = f"{doing}() ended the process with exit code {error.code}{place}"
         elif doing == "make":
-            what = f"it cannot be made by Gymnasium: {reason_of(error)}{place}"
+            what = f"it {CANNOT_BE_MADE}: {reason_of(error)}{place}"
         else:
             what = f"{doing}() raised {reason_of(error)}{place}"
         return self._refused(what, error)

@@ -111,10 +111,9 @@ class RolloutWorker:
 
     def _too_large(self, reward: NDArray[np.float32]) -> str:
         env, bad = self._settings.env, reward[~np.isfinite(reward)][0]
-        cause = f"reward_scale {env.world.reward_scale:g}" if env.is_swarm else f"the rewards of env_id {env.env_id!r}"
-        return (
-            f"{cause} makes a {self._settings.n_step}-step return of {bad}, which no float32 holds; scale rewards down"
-        )
+        cause = f"reward_scale {env.world.reward_scale:g}" if env.is_swarm else f"env_id {env.env_id!r}"
+        what = f"{self._settings.n_step}-step return of {bad}, which float32 does not hold"
+        return f"{cause} gives a {what}; scale its rewards down"
 
     def _step(
         self, policy: Policy, random_actions: NDArray[np.int64], steps: Steps, ended: EpisodeStats, i: int
