@@ -18,7 +18,6 @@ from learner import file_names
 from learner.config import RunConfig, from_dict, to_dict, user_files
 from sim_core.checks import ConfigError, require
 
-
 REFUSED = {file_names.LOCK, file_names.ENV_TRACE}
 """Files of a run that was refused at its start."""
 
