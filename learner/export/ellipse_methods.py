@@ -17,15 +17,13 @@ from torch.nn import functional
 
 from actors.policy.network import Network
 from learner.export.ports import Port
-from learner.export.robot_module import Decision, RobotModule, relative_positions
+from learner.export.robot_module import NO_DECISION, Decision, RobotModule, measured, relative_positions
 from sim_core.config import WorldConfig
 from sim_core.methods.apf import NEAREST_M, field_params
 from sim_core.methods.ellipse import ellipse_params
 from sim_core.methods.group_ellipses import COLUMN_NAMES, observation_limit
 from sim_core.worlds import WorldBatch
 
-NO_DECISION = -1
-"""Action where the state cannot be formed."""
 DECIDE = -1
 """Stands for no held action: the robot decides."""
 
@@ -79,7 +77,6 @@ class EllipseRobot(RobotModule):
         self.ellipse = ellipse_params(config)
         self.field = RepulsiveField(config)
         self.limit = observation_limit(config)
-        self.decides_always = config.senses_badly
         method = config.method_class
         self.absent = len(method.observation_names(config)) - config.groups * method.row_size
         counted = torch.zeros(config.groups, dtype=torch.float64)
@@ -115,7 +112,7 @@ class EllipseRobot(RobotModule):
     @classmethod
     def undecided(cls, config: WorldConfig) -> str:
         """There is no decision without an ellipse of every group."""
-        return "" if config.senses_badly else "; -1 and no velocity where a group has no robot"
+        return super().undecided(config) + ("" if config.senses_badly else ", or a group has no robot")
 
     @classmethod
     def sense(cls, worlds: WorldBatch) -> dict[str, NDArray[Any]]:
@@ -195,13 +192,16 @@ class EllipseRobot(RobotModule):
 
     def _decide(self, positions: Tensor, mask: Tensor, goals: Tensor, held: Tensor | None) -> Decision:
         """As `forward`; goes on with the actions `held` `[batch]` int64 where they are not DECIDE."""
-        positions = torch.where(mask.unsqueeze(-1), positions, 0.0)
+        positions, known = measured(positions, mask)
+        goals, goals_known = measured(goals, torch.ones_like(goals[..., 0]) > 0.0)
         matrix = self._matrix(positions, mask, goals)
         if self.config.group_order == "nearest":
             matrix = self._nearest_first(matrix, positions, mask)
         observation = functional.pad(matrix.flatten(1), (0, self.absent))
         values = self.network(observation)
-        known = torch.ones_like(mask[:, 0, :1]).any(1) if self.decides_always else mask.any(2).all(1)
+        known = known & goals_known
+        if not self.decides_always:
+            known = known & mask.any(2).all(1)
         action = values.argmax(1)
         if held is not None:
             action = torch.where(held >= 0, held, action)

@@ -1,16 +1,21 @@
-"""M_sensor's decision as a torch module (see `robot_module`)."""
+"""M_sensor's decision as a torch module (see `robot_module`).
+
+Where the robot senses none of its group there is no decision. A policy that has learned with bad senses decides there,
+too.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from actors.policy.network import Network
 from learner.export.ports import Port
-from learner.export.robot_module import Decision, RobotModule, relative_positions
+from learner.export.robot_module import NO_DECISION, Decision, RobotModule, measured, relative_positions
 from sim_core.config import WorldConfig
 from sim_core.methods.m_sensor import COUNT_LIMIT, sector_edges
 from sim_core.worlds import WorldBatch
@@ -61,6 +66,20 @@ class SensorRobot(RobotModule):
         )
 
     @classmethod
+    def undecided(cls, config: WorldConfig) -> str:
+        """A robot that senses none of its group is lost, where an episode of its training has ended."""
+        alone = "" if config.senses_badly else f", or no robot of the own group is within {config.outer_radius_m} m"
+        return super().undecided(config) + alone
+
+    @classmethod
+    def decides(cls, worlds: WorldBatch) -> NDArray[np.bool_]:
+        """Where a robot of the own group is within R2; everywhere if the policy has learned with bad senses."""
+        relative, mask, _ = relative_positions(worlds)
+        x, y = relative[:, 0, :, 0], relative[:, 0, :, 1]
+        near = mask[:, 0] & (x * x + y * y < np.float32(worlds.config.outer_radius_m) ** 2)
+        return np.asarray(near.any(1) | worlds.config.senses_badly)
+
+    @classmethod
     def sense(cls, worlds: WorldBatch) -> dict[str, NDArray[Any]]:
         """Own and other robots, whose places beyond a smaller group's robots are masked."""
         relative, mask, _ = relative_positions(worlds)
@@ -85,7 +104,7 @@ class SensorRobot(RobotModule):
 
     def _counts(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Robots per cell `[batch, 2q]` float32."""
-        cell, near = self._cells(torch.where(mask.unsqueeze(-1), positions, 0.0))
+        cell, near = self._cells(positions)
         here = (cell.unsqueeze(-1) == self.cells) & (near & mask).unsqueeze(-1)
         return here.float().sum(1)
 
@@ -98,9 +117,14 @@ class SensorRobot(RobotModule):
           other: relative positions `[batch, other robots, 2]` float32 of robots of other groups.
           other_mask: `[batch, other robots]` bool.
         """
+        own, own_known = measured(own, own_mask)
+        other, other_known = measured(other, other_mask)
         mates, others = self._counts(own, own_mask), self._counts(other, other_mask)
         counts = torch.cat([mates, others], dim=1) if self.separate else mates - others
         observation = counts.clamp(-COUNT_LIMIT, COUNT_LIMIT)
         values = self.network(observation)
-        action = values.argmax(1)
-        return self.headings[action], action, values, observation
+        action, known = values.argmax(1), own_known & other_known
+        if not self.decides_always:
+            known = known & (mates.sum(1) > 0.0)
+        velocity = torch.where(known.unsqueeze(1), self.headings[action], 0.0)
+        return velocity, torch.where(known, action, NO_DECISION), values, observation

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from actors.evaluation.evaluator import Candidate, make_action_rule
 from actors.policy.policy import Policy, WeightsSnapshot
 from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
-from learner.export.robot_module import robot_class
+from learner.export.robot_module import NO_DECISION, RobotModule, robot_class
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig
 from sim_core.worlds import WorldBatch, is_done
@@ -55,19 +55,26 @@ def swarm_states(config: WorldConfig, driver: Candidate, weights: WeightsSnapsho
     observation, taken = worlds.reset(), list[Sensed]()
     for step in range(EVERY_STEPS * -(-count // size)):
         if step % EVERY_STEPS == 0:
-            taken.append(Sensed(robot.sense(worlds), _decided(worlds, policy, observation)))
+            taken.append(Sensed(robot.sense(worlds), _decided(worlds, robot, policy, observation)))
         result = worlds.step(rule.act(observation))
         done = is_done(result.outcome)
         observation = worlds.reset(done) if done.any() else result.observation
     return _joined(taken, count)
 
 
-def _decided(worlds: WorldBatch, policy: Policy, observation: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    values, action = policy.values(observation), policy.greedy(observation)
+def _decided(
+    worlds: WorldBatch, robot: type[RobotModule], policy: Policy, observation: NDArray[Any]
+) -> dict[str, NDArray[Any]]:
+    values, action, decides = policy.values(observation), policy.greedy(observation), robot.decides(worlds)
     velocity = np.zeros((2, worlds.num_worlds), np.float32)
     worlds.method.velocity(worlds.sensed, action, velocity[0], velocity[1])
-    seen = observation.astype(np.float32)
-    return {"velocity": velocity.T, "action": action, "action_values": values, "observation": seen}
+    seen, velocity[:, ~decides] = observation.astype(np.float32), 0.0
+    return {
+        "velocity": velocity.T,
+        "action": np.where(decides, action, NO_DECISION),
+        "action_values": values,
+        "observation": seen,
+    }
 
 
 def _joined(taken: list[Sensed], count: int) -> Sensed:

@@ -29,6 +29,27 @@ float32, and the observation `[batch, size]` float32 that the network saw. Plain
 """
 
 
+NO_DECISION = -1
+"""Action where the state cannot be formed; the velocity is then zero."""
+FARTHEST = 1e9
+"""A number beyond it, and one that is none (NaN), is no measurement."""
+
+
+def is_measured(values: Tensor) -> Tensor:
+    """Where `values` are numbers and not infinite, by a comparison that an exported graph keeps."""
+    return values.abs() <= FARTHEST
+
+
+def measured(positions: Tensor, used: Tensor) -> tuple[Tensor, Tensor]:
+    """Positions `[batch, ..., 2]` with zeros in places that are not used or were not measured.
+
+    Also whether all places that are used were measured, `[batch]`; `used` is `[batch, ...]` bool.
+    """
+    good = is_measured(positions).all(-1)
+    missing = (used & ~good).flatten(1).float().sum(1)
+    return torch.where((used & good).unsqueeze(-1), positions, 0.0), missing == 0.0
+
+
 class BarePolicy(nn.Module):
     """Observation to action values and the greedy action, for any environment.
 
@@ -41,9 +62,13 @@ class BarePolicy(nn.Module):
         self.network = network
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """(action `[batch]` int64, action values `[batch, actions]`) of observations `[batch, *shape]`."""
+        """(action `[batch]` int64, action values `[batch, actions]`) of observations `[batch, *shape]`.
+
+        The action is NO_DECISION where an element of the observation is not a number or infinite.
+        """
         values = self.network(observation)
-        return values.argmax(1), values
+        known = is_measured(observation.float()).flatten(1).all(1)
+        return torch.where(known, values.argmax(1), NO_DECISION), values
 
 
 class RobotModule(nn.Module):
@@ -59,6 +84,7 @@ class RobotModule(nn.Module):
     def __init__(self, network: Network, config: WorldConfig) -> None:
         super().__init__()
         self.network = network
+        self.decides_always = config.senses_badly
         self.register_buffer("headings", torch.from_numpy(heading_velocities(config, "float32")))
 
     @classmethod
@@ -74,7 +100,12 @@ class RobotModule(nn.Module):
     @classmethod
     def undecided(cls, config: WorldConfig) -> str:
         """What to say of an action where the state cannot be formed."""
-        return ""
+        return f"; {NO_DECISION} and no velocity where a position that is used is not a number or infinite"
+
+    @classmethod
+    def decides(cls, worlds: WorldBatch) -> NDArray[np.bool_]:
+        """The worlds `[num_worlds]` whose learning robot senses enough to decide."""
+        return np.ones(worlds.num_worlds, np.bool_)
 
     @classmethod
     def sense(cls, worlds: WorldBatch) -> dict[str, NDArray[Any]]:

@@ -8,9 +8,9 @@ import torch
 
 from actors.policy.baselines import Baseline
 from actors.policy.network import QNetwork, snapshot
-from learner.export.ellipse_methods import NO_DECISION, InsideRobot, OutsideRobot, RepulsiveField
+from learner.export.ellipse_methods import InsideRobot, OutsideRobot, RepulsiveField
 from learner.export.reference_states import swarm_states
-from learner.export.robot_module import make_robot
+from learner.export.robot_module import NO_DECISION, BarePolicy, make_robot
 from sim_core.config import WorldConfig
 from sim_core.methods import make_method
 from sim_core.methods.apf import field_params, repulsion
@@ -98,7 +98,7 @@ def test_between_decisions_it_drives_as_the_simulator(method):
     for _ in range(8):
         sensed, driven = [robot.sense(worlds)], []
         action = decide(robot, *sensed[0].values())["action"]
-        worlds.step(action, watch)
+        worlds.step(np.maximum(action, 0), watch)  # in worlds that have ended as lost there is no decision
         running = worlds.state.steps[:, None] == worlds.state.steps.max()  # the others stopped where they ended
         for step, inputs in enumerate(sensed[:-1]):
             if step and "held" in inputs:
@@ -202,3 +202,49 @@ def test_without_a_robot_of_every_group_there_is_no_decision():
     assert found["action"][0] != NO_DECISION and np.abs(found["velocity"][0]).max() > 0.0
     assert found["action"][1] == NO_DECISION and (found["velocity"][1] == 0.0).all()
     assert np.isfinite(found["action_values"]).all()
+
+
+def test_a_robot_that_senses_none_of_its_group_stops():
+    """As where its training has ended; far robots and those of other groups are no company."""
+    config = WorldConfig(robots=4, groups=2)
+    own, other = np.full((4, 3, 2), 0.4, np.float32), np.full((4, 4, 2), -0.4, np.float32)
+    own_mask, other_mask = np.ones((4, 3), bool), np.ones((4, 4), bool)
+    own_mask[1] = other_mask[1] = False  # nobody at all
+    own_mask[2] = False
+    own[3] = 1.2  # beyond R2
+    found = decide(make_robot(lively(config), config), own, own_mask, other, other_mask)
+    assert (found["action"] == NO_DECISION).tolist() == [False, True, True, True]
+    assert (np.abs(found["velocity"]).max(1) == 0.0).tolist() == [False, True, True, True]
+    empty = np.zeros((1, 0, 2), np.float32), np.zeros((1, 0), bool)
+    assert decide(make_robot(lively(config), config), *empty, *empty)["action"] == [NO_DECISION]
+    trained = WorldConfig(robots=4, groups=2, position_loss=0.5)
+    assert (decide(make_robot(lively(trained), trained), own, own_mask, other, other_mask)["action"] >= 0).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("config", WORLDS.values(), ids=WORLDS)
+def test_a_position_that_is_no_number_stops_the_robot_where_it_counts(config, value):
+    states = swarm_states(config, Baseline.FL_ORCA, snapshot(lively(config), 0, 0.0), seed=5, count=40)
+    robot = make_robot(lively(config), config)
+    before = decide(robot, *states.inputs.values())
+    filled = {name for name, array in states.inputs.items() if array.size}
+    for name in filled & {"own", "other", "positions", "goals"}:
+        inputs = {key: array.copy() for key, array in states.inputs.items()}
+        mask = inputs.get(f"{name}_mask", inputs.get("mask")) if name != "goals" else None
+        place = (slice(None), *([0] * (inputs[name].ndim - 2)))
+        inputs[name][(*place, 1)] = value
+        counts = np.ones(40, bool) if mask is None else mask[place]
+        found = decide(robot, *inputs.values())
+        assert (found["action"][counts] == NO_DECISION).all() and (found["velocity"][counts] == 0.0).all()
+        assert all(np.isfinite(answer).all() for answer in found.values())
+        np.testing.assert_array_equal(found["action"][~counts], before["action"][~counts])
+        np.testing.assert_array_equal(found["velocity"][~counts], before["velocity"][~counts])
+
+
+def test_a_bare_policy_does_not_decide_on_what_is_no_number():
+    config = WorldConfig(robots=4, groups=2)
+    policy, observation = BarePolicy(lively(config)), np.ones((3, 16), np.float32)
+    observation[1, 5], observation[2, 0] = np.nan, np.inf
+    with torch.no_grad():
+        action = policy(torch.from_numpy(observation))[0].numpy()
+    assert (action == NO_DECISION).tolist() == [False, True, True]

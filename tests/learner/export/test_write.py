@@ -15,7 +15,7 @@ from actors.rollout.vector_env import env_shape
 from learner.config import RunConfig
 from learner.export.ports import bare_inputs, bare_outputs
 from learner.export.reference_states import observed_states, swarm_states
-from learner.export.robot_module import BarePolicy, make_robot, robot_class
+from learner.export.robot_module import NO_DECISION, BarePolicy, make_robot, robot_class
 from learner.export.write import (
     GOLDEN,
     METADATA,
@@ -104,6 +104,26 @@ def test_any_number_of_robots_fits(exported):
         for name in names:
             np.testing.assert_allclose(got[name], program[name], atol=1e-5)
     np.testing.assert_array_equal(run_onnx(folder / ONNX, one)["action"], states.expected["action"][:1])
+
+
+def test_both_files_stop_the_robot_where_it_cannot_decide(exported):
+    """Nobody in sight, and positions that are no numbers."""
+    config, folder, states = exported
+    names = [port.name for port in robot_class(config).outputs(config)]
+    blind = {name: np.zeros_like(array) if name.endswith("mask") else array for name, array in states.inputs.items()}
+    wrong = [
+        {
+            name: np.full_like(array, value) if array.dtype == np.float32 else array
+            for name, array in states.inputs.items()
+        }
+        for value in (np.nan, np.inf)
+    ]
+    for inputs in (blind, *wrong):
+        for got in (run_onnx(folder / ONNX, inputs), run_program(folder / PROGRAM, inputs, names)):
+            assert (got["action"] == NO_DECISION).all() and (got["velocity"] == 0.0).all()
+            assert np.isfinite(got["action_values"]).all() and np.isfinite(got["observation"]).all()
+    (action,) = [port for port in robot_class(config).outputs(config) if port.name == "action"]
+    assert "-1 and no velocity where" in action.meaning
 
 
 def test_golden_states_come_with_their_answers(exported):
