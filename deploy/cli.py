@@ -24,7 +24,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import tyro  # noqa: E402
 
 from actors.service.fault_policy import RunFailed  # noqa: E402
-from deploy.options.results import Dashboard, Evaluate, Export, Relocate, Report, Watch  # noqa: E402
+from deploy.options.results import Dashboard, Evaluate, Export, Relocate, Report, Stress, Watch  # noqa: E402
 from deploy.options.training import Chaos, Resume, Submit, Sweep, Train, ray_address  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
 from learner.presets import TrainingPreset, preset_config  # noqa: E402
@@ -34,13 +34,14 @@ from sim_core.checks import ConfigError, require, require_packages  # noqa: E402
 FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
-Command = Train | Sweep | Report | Resume | Evaluate | Watch | Chaos | Export | Submit | Dashboard | Relocate
+Command = Train | Sweep | Report | Resume | Evaluate | Stress | Watch | Chaos | Export | Submit | Dashboard | Relocate
 COMMANDS: dict[type[Command], str] = {
     Train: "train",
     Sweep: "sweep",
     Report: "report",
     Resume: "resume",
     Evaluate: "evaluate",
+    Stress: "stress",
     Watch: "watch",
     Chaos: "chaos",
     Export: "export",
@@ -152,7 +153,7 @@ def _joins_cluster(command: Command) -> bool:
     if isinstance(command, Train | Sweep):
         return command.launch.ray_address() is not None
     return isinstance(command, Submit) or (
-        isinstance(command, Resume | Evaluate) and ray_address(command.address) is not None
+        isinstance(command, Resume | Evaluate | Stress) and ray_address(command.address) is not None
     )
 
 

@@ -271,12 +271,12 @@ class WorldConfig:
     @property
     def senses_badly(self) -> bool:
         """Whether the learning robot senses other robots otherwise than they are."""
-        return any(getattr(self, name) != UNIMPAIRED[name] for name in SENSE_CONDITIONS)
+        return _differs(self, SENSE_CONDITIONS)
 
     @property
     def drives_badly(self) -> bool:
         """Whether the learning robot moves otherwise than its commands say."""
-        return any(getattr(self, name) != UNIMPAIRED[name] for name in COMMAND_CONDITIONS)
+        return _differs(self, COMMAND_CONDITIONS)
 
     @property
     def setup(self) -> str:
@@ -284,6 +284,11 @@ class WorldConfig:
         sizes = self.group_sizes
         alike = f"{sizes[0]}r×{self.groups}g" if len(set(sizes)) == 1 else f"{'+'.join(map(str, sizes))}r"
         return alike if self.scene in SCENES.built_in else f"{short_name(SCENES, self.scene)} {alike}"
+
+
+def _differs(config: WorldConfig, names: list[str]) -> bool:
+    """Whether one of the fields `names` has another value than its default."""
+    return any(getattr(config, name) != WorldConfig.__dataclass_fields__[name].default for name in names)
 
 
 def _take_sources(config: WorldConfig) -> None:
@@ -362,8 +367,7 @@ SENSE_CONDITIONS = (
     "group_mix_up"
 ).split()
 COMMAND_CONDITIONS = "command_delay_steps speed_error heading_error_deg".split()
-UNIMPAIRED: dict[str, float] = dict.fromkeys(SENSE_CONDITIONS + COMMAND_CONDITIONS, 0) | {"field_of_view_deg": 360.0}
-"""Every condition of sensing and driving, with its value where there is none."""
+"""Conditions of sensing and driving; there is none where all have their defaults."""
 ANGLES = "separation_angle_deg sight_angle_deg view_angle_deg".split()
 
 

@@ -22,7 +22,7 @@ def evaluation_table(evaluation: Evaluation, title: str, kind: str = "greedy epi
     table.add_column("value", justify="right")
     table.add_column("95 % interval", justify="right")
     for outcome, estimate in evaluation.rates.items():
-        table.add_row(outcome_label(outcome).replace("_", " "), *_percent(estimate))
+        table.add_row(outcome_label(outcome).replace("_", " "), *percent(estimate))
     table.add_row("mean return", *_plain(evaluation.episode_return, 2))
     table.add_row("mean episode length (steps)", *_plain(evaluation.episode_length, 1))
     return table
@@ -34,7 +34,7 @@ def setups_table(by_setup: dict[str, Evaluation]) -> Table:
     for name in ("setup", "success rate", "95 % interval"):
         table.add_column(name, justify="left" if name == "setup" else "right")
     for setup, evaluation in by_setup.items():
-        table.add_row(setup, *_percent(evaluation.rates[Outcome.GOAL]))
+        table.add_row(setup, *percent(evaluation.rates[Outcome.GOAL]))
     return table
 
 
@@ -49,7 +49,7 @@ def compared(setup: str, name: str, goals: list[NDArray[np.bool_]]) -> tuple[str
     Returns:
       Setup, name, success rate with interval; difference to the first with interval, and the sign test.
     """
-    played = (setup, name, *_percent(rate(int(goals[-1].sum()), len(goals[-1]))))
+    played = (setup, name, *percent(rate(int(goals[-1].sum()), len(goals[-1]))))
     if len(goals) == 1:
         return (*played, "", "", "")
     paired = paired_comparison(goals[0], goals[-1])
@@ -58,9 +58,18 @@ def compared(setup: str, name: str, goals: list[NDArray[np.bool_]]) -> tuple[str
     return (*played, f"{value:+.1f}", f"{low:+.1f} … {high:+.1f}", sign)
 
 
-def _percent(estimate: Estimate) -> tuple[str, str]:
+def percent(estimate: Estimate) -> tuple[str, str]:
+    """A rate and its interval."""
     value, low, high = (100 * number for number in estimate)
     return f"{value:.1f} %", f"{low:.1f} … {high:.1f} %"
+
+
+def signed_percent(difference: Estimate | None) -> str:
+    """A difference of rates with its interval, in points; empty for none."""
+    if difference is None:
+        return ""
+    value, low, high = (100 * number for number in difference)
+    return f"{value:+.1f} ({low:+.1f} … {high:+.1f})"
 
 
 def _plain(estimate: Estimate, digits: int) -> tuple[str, str]:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseCounterAction, arg
 
+from actors.evaluation.conditions import grid, parse_axis
 from learner.presets import PresetName
 from sim_core.checks import require
 
@@ -29,11 +30,8 @@ class Report:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate:
-    """Play greedy policies of runs, or baselines, on fixed seeds; print rates with 95 % intervals.
-
-    Several players meet the same start scenes; their differences to the first are paired.
-    """
+class Players:
+    """Who plays which episodes where."""
 
     run: Positional[tuple[str, ...]]
     """Names of runs, or their folders; or fl-orca, fl-orca-snapped, greedy, field, random (a run so named: ./NAME)."""
@@ -51,10 +49,6 @@ class Evaluate:
     """Groups; by default those of the training, or 2 for a baseline. Others test Extrapolation."""
     checkpoint: str = "newest"
     """The policy's checkpoint: newest, best (by the evaluations during training), or a name (step-…)."""
-    out: Path | None = None
-    """New .zarr file for the results: seed, outcome, length and return of every episode."""
-    record: int = 0
-    """Number of first episodes whose trajectories are stored in FILE-episodes.zarr beside the results; needs --out."""
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
     address: str | None = None
@@ -63,12 +57,28 @@ class Evaluate:
     def __post_init__(self) -> None:
         require(len(self.run) > 0, "name a run, or a baseline, as in `shoal evaluate greedy`")
         require(len(set(self.run)) == len(self.run), f"name each player once, not {' '.join(self.run)}")
-        require(len(self.run) == 1 or self.out is None, "--out stores the results of one player; evaluate it alone")
         require(1 <= self.episodes <= 10**7, f"--episodes must be in 1..{10**7}, not {self.episodes}")
         require(
             0 <= self.first_seed <= 2**32 - 1 - self.episodes,
             f"--first-seed must be in 0..{2**32 - 1 - self.episodes}, not {self.first_seed}",
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Players):
+    """Play greedy policies of runs, or baselines, on fixed seeds; print rates with 95 % intervals.
+
+    Several players meet the same start scenes; their differences to the first are paired.
+    """
+
+    out: Path | None = None
+    """New .zarr file for the results: seed, outcome, length and return of every episode."""
+    record: int = 0
+    """Number of first episodes whose trajectories are stored in FILE-episodes.zarr beside the results; needs --out."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(len(self.run) == 1 or self.out is None, "--out stores the results of one player; evaluate it alone")
         require(
             0 <= self.record <= self.episodes,
             f"--record must be in 0..{self.episodes} (--episodes), not {self.record}",
@@ -80,6 +90,29 @@ class Evaluate:
             self.out is None or (self.out.suffix == ".zarr" and bool(self.out.stem)),
             f"--out must name a file that ends in .zarr, not {str(self.out)!r}",
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stress(Players):
+    """Play policies and rules under a grid of bad senses and late commands; print and draw where they break.
+
+    All players meet the same start scenes under every condition; differences are paired. What was played is stored,
+    and the same command plays what is missing.
+    """
+
+    vary: tuple[str, ...] = (
+        "position_loss=0,0.25,0.5,0.75",
+        "position_noise_m=0,0.1,0.3",
+        "position_delay_steps=0,5,10",
+        "dropped_mates=0,2",
+    )
+    """Axes of the grid, NAME=VALUE,VALUE,...: conditions of `shoal train --help` (position_loss ...), or shield."""
+    name: str | None = None
+    """Name of the results' folder under RUNS_DIR/stress; made of the players' names by default."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        grid([parse_axis(text) for text in self.vary])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, TypeVarTuple
@@ -174,19 +174,35 @@ def leave() -> None:
 def evaluate_in_tasks(
     specs: list[EnvSpec], candidate: Candidate, seeds: list[int], address: str | None
 ) -> list[EpisodeStats]:
-    """Plays one episode per environment and seed in Ray tasks on all CPUs (see `connect` for further errors).
+    """Plays one episode per environment and seed in Ray tasks on all CPUs (see `evaluate_each` for errors).
 
     Returns:
       For each environment one entry per seed, in order.
+    """
+    return list(evaluate_each([(spec, candidate) for spec in specs], seeds, address))
+
+
+def evaluate_each(
+    work: Iterable[tuple[EnvSpec, Candidate]], seeds: list[int], address: str | None
+) -> Iterator[EpisodeStats]:
+    """Plays one episode per seed for each pair of an environment and who plays there, one pair after the other.
+
+    All of it is played in Ray tasks on all CPUs (see `connect` for further errors), from one start of Ray.
+
+    Yields:
+      For each pair, as soon as it is played, one entry per seed, in order.
 
     Raises:
       RunFailed: a task fails again and again.
     """
     connect(1, address)
-    calls = RayCalls(DEADLINE_S)
+    calls, sent = RayCalls(DEADLINE_S), dict[int, Ref[Candidate]]()
     try:
-        who, cpus = calls.put(candidate), cluster_cpus()
-        return [evaluate_in_parallel(calls, spec, who, seeds, cpus) for spec in specs]
+        cpus = cluster_cpus()
+        for spec, candidate in work:
+            if id(candidate) not in sent:
+                sent[id(candidate)] = calls.put(candidate)
+            yield evaluate_in_parallel(calls, spec, sent[id(candidate)], seeds, cpus)
     except CallFailed as failure:
         raise RunFailed(f"the evaluation {failure.fault} again and again: {failure.reason}") from failure
     finally:

@@ -277,6 +277,10 @@ class Tracker:
         else:
             self._client.log_artifact(self.run_id, str(path))
 
+    def attach(self, run_id: str, path: Path, place: str) -> None:
+        """Uploads a file to the folder `place` of the artifacts of a run that has ended."""
+        self._client.log_artifact(run_id, str(path), place)
+
     def set_views(self) -> None:
         """Adds the views of `mlflow_views` to the experiment; logs a warning for each that the store refuses."""
         now_ms = int(time.time() * 1000)

@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 
 import deploy.commands.evaluate
 import deploy.commands.report
+import deploy.commands.stress
 import deploy.commands.sweep
 import deploy.commands.train
 import deploy.commands.watch
@@ -90,6 +91,7 @@ def workplace(folder: Path) -> Iterator[None]:
         deploy.commands.train: ("Tracker",),
         deploy.commands.sweep: ("run_cells", "Tracker"),
         deploy.commands.evaluate: ("evaluate_in_tasks", "record_episode"),
+        deploy.commands.stress: ("evaluate_each",),
         deploy.commands.watch: ("record_episode", "foreign_animation"),
         deploy.commands.report: ("_write",),
     }
@@ -158,10 +160,10 @@ FLAGS = sorted(
     | set(
         "--config --preset --runs-dir --name --experiment --address --checkpoint-url --keep-best --at-once --known "
         "--out --total-env-steps --episodes --first-seed --record --checkpoint --format --help -h --tracking-uri "
-        "--no-such-flag -- --=".split()
+        "--vary --no-such-flag -- --=".split()
     )
 )
-COMMANDS = ("train", "sweep", "report", "resume", "evaluate", "watch")
+COMMANDS = ("train", "sweep", "report", "resume", "evaluate", "stress", "watch")
 NUMBERS = st.one_of(
     st.integers(-3, 12).map(str),
     st.sampled_from("0 1 2 64 1000 1000000 4294967295 99999999999 1e9 1e400 -1e9 nan inf -inf 0.5 0x10 1_000".split()),

@@ -173,6 +173,9 @@ def test_files_and_folders_become_artifacts(tracker, tmp_path):
     client = mlflow.MlflowClient(tracker.uri)
     assert sorted(file.path for file in client.list_artifacts(tracker.run_id)) == ["figures", "report.html"]
     assert [file.path for file in client.list_artifacts(tracker.run_id, "figures")] == ["figures/curve.png"]
+    tracker.attach(tracker.run_id, tmp_path / "report.html", "stress/r+greedy")
+    found = client.list_artifacts(tracker.run_id, "stress/r+greedy")
+    assert [file.path for file in found] == ["stress/r+greedy/report.html"]
 
 
 @pytest.fixture

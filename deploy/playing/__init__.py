@@ -1,0 +1,1 @@
+"""Who plays which episodes for `shoal evaluate` and `shoal stress`, and what was played."""
