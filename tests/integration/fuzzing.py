@@ -82,7 +82,7 @@ def workplace(folder: Path) -> Iterator[None]:
     for name, config in runs.items():
         run = RunFolder(folder / "runs" / name)
         run.save_config(config)
-        run.save_identity(RunIdentity(name, "sqlite:///x.db", "shoal", "0"))
+        run.save_identity(RunIdentity(name, "http://127.0.0.1:9", "shoal", "0"))
     (folder / "no-run").mkdir()
     (folder / "a-file").write_text("of no use")
     (folder / "results.csv").write_text("preset,policy\n")
