@@ -195,14 +195,14 @@ COLUMN_NAMES = ("a", "b", "x_c", "y_c", "theta", "x_g", "y_g", "u_apf_x", "u_apf
 """Elements of a group's row; `a` and `b` are the smaller and the larger half-axis."""
 ELLIPSE_WORLD: dict[str, Any] = {**SWARM_WORLD, "ellipse_counts_learner": True, "learner_speed_limit_m_s": 1.5}
 """The world of the presets (see `learner.presets`)."""
-BEST_WORLD = {**ELLIPSE_WORLD, "ellipse_reward": "progress"}
-ELLIPSE_PRESETS = {
-    "thesis": Preset({"n_step": 1, "samples_per_insert": 4.0}, ELLIPSE_WORLD),
-    "best": Preset({"n_step": 3, "samples_per_insert": 4.0}, BEST_WORLD),
-    "generalist": Preset(
-        {"discount": 0.97, "network": "pooled"}, {**BEST_WORLD, "group_rows": 16, "decision_interval_steps": 4}
-    ),
-}
+BEST_WORLD = {**ELLIPSE_WORLD, "ellipse_reward": "progress", "apf_gain_m4_s": 0.05}
+TURNED: dict[str, Any] = {"random_turns": True, "teacher_decay_env_steps": 500_000}
+"""Settings of training in `best`; each method has a teacher of its own."""
+POOLED: dict[str, Any] = {"network": "pooled", "teacher_decay_env_steps": 2_000_000}
+"""Settings of training in `generalist`, beside those."""
+MOST_GROUPS = 16
+"""Groups that a policy of the preset `generalist` can tell apart."""
+THESIS = Preset({"n_step": 1, "samples_per_insert": 4.0}, ELLIPSE_WORLD)
 
 
 class EllipseMethod(Method):
@@ -214,7 +214,6 @@ class EllipseMethod(Method):
 
     timeout_fails = True
     draws = frozenset({"ellipses"})
-    presets = ELLIPSE_PRESETS
     row_size: ClassVar[int] = ELLIPSE_COLUMNS
 
     observation_dtype = np.float32

@@ -12,11 +12,16 @@ from sim_core.methods.base import Preset, Rule
 from sim_core.methods.group_ellipses import (
     BEST_WORLD,
     ELLIPSE_COLUMNS,
-    ELLIPSE_PRESETS,
     FIELD_COLUMNS,
+    MOST_GROUPS,
+    POOLED,
+    THESIS,
+    TURNED,
     EllipseMethod,
 )
 from sim_core.methods.headings import heading_velocities
+
+TAUGHT: dict[str, Any] = {**TURNED, "discount": 0.99, "teacher": "field"}
 
 
 class InsideMethod(EllipseMethod):
@@ -26,23 +31,9 @@ class InsideMethod(EllipseMethod):
     robot_module = "learner.export.ellipse_methods:InsideRobot"
     row_size = ELLIPSE_COLUMNS + FIELD_COLUMNS
     presets = {
-        **ELLIPSE_PRESETS,
-        "generalist": Preset(
-            {
-                "discount": 0.98,
-                "network": "pooled",
-                "total_env_steps": 3_000_000,
-                "learning_rate_decay_env_steps": 3_000_000,
-            },
-            {
-                **BEST_WORLD,
-                "group_rows": 16,
-                "decision_interval_steps": 2,
-                "history": 2,
-                "sectors": 16,
-                "stop_action": True,
-            },
-        ),
+        "thesis": THESIS,
+        "best": Preset(TAUGHT, BEST_WORLD),
+        "generalist": Preset(TAUGHT | POOLED, {**BEST_WORLD, "group_rows": MOST_GROUPS, "apf_rows": "all"}),
     }
 
     @classmethod

@@ -15,9 +15,13 @@ from sim_core.checks import require
 from sim_core.config import WorldConfig
 from sim_core.jit import kernel
 from sim_core.methods.apf import field_of, field_params, limited
-from sim_core.methods.group_ellipses import EllipseMethod
+from sim_core.methods.base import Preset
+from sim_core.methods.group_ellipses import BEST_WORLD, MOST_GROUPS, POOLED, THESIS, TURNED, EllipseMethod
 from sim_core.packed import packed
 from sim_core.state import WorldState
+
+TAUGHT: dict[str, Any] = {**TURNED, "teacher": "greedy"}
+SLOW_WORLD: dict[str, Any] = {**BEST_WORLD, "decision_interval_steps": 4}
 
 
 @kernel
@@ -34,6 +38,11 @@ class OutsideMethod(EllipseMethod):
 
     label = "M_OUT"
     robot_module = "learner.export.ellipse_methods:OutsideRobot"
+    presets = {
+        "thesis": THESIS,
+        "best": Preset(TAUGHT, SLOW_WORLD),
+        "generalist": Preset(TAUGHT | POOLED, {**SLOW_WORLD, "group_rows": MOST_GROUPS}),
+    }
 
     def __init__(self, config: WorldConfig) -> None:
         super().__init__(config)

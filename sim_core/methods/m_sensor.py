@@ -27,17 +27,6 @@ COUNT_LIMIT = 127
 """Counts saturate here, so that they fit int8."""
 WORLD: dict[str, Any] = {"max_neighbours": 16, "orca_radius_m": 0.18, "robot_radius_m": 0.06}
 """The world of the presets (see `learner.presets`)."""
-BEST_TRAINING: dict[str, Any] = {
-    "total_env_steps": 500_000,
-    "discount": 0.97,
-    "n_step": 3,
-    "samples_per_insert": 8.0,
-    "learning_rate": 3e-4,
-    "learning_rate_end": 2e-5,
-    "learning_rate_decay_env_steps": 500_000,
-    "epsilon_decay_env_steps": 100_000,
-    "replay_capacity": 500_000,
-}
 BEST_WORLD: dict[str, Any] = {
     **WORLD,
     "sensor_counts": "separate",
@@ -136,8 +125,8 @@ class SensorMethod(Method):
     draws = frozenset({"sectors"})
     presets = {
         "thesis": Preset({"n_step": 1, "samples_per_insert": 1.5}, WORLD),
-        "best": Preset(BEST_TRAINING, BEST_WORLD),
-        "generalist": Preset({"discount": 0.97}, BEST_WORLD),
+        "best": Preset({}, BEST_WORLD),
+        "generalist": Preset({}, BEST_WORLD),
     }
     robot_module = "learner.export.m_sensor:SensorRobot"
 
