@@ -56,6 +56,11 @@ class ShieldTile(NamedTuple):
     asked_y: Any
 
 
+def shield_responsibility(config: WorldConfig) -> float:
+    """The share of the avoidance that the learning robot takes: half where the swarm takes the other half, else all."""
+    return 0.5 if config.learner_is_known else 1.0
+
+
 def shield_params(config: WorldConfig) -> ShieldParams:
     """The constants of `config`."""
     return ShieldParams(
@@ -65,7 +70,7 @@ def shield_params(config: WorldConfig) -> ShieldParams:
             config.time_step_s,
             config.method_class.top_speed_m_s(config) * SPEED_MARGIN,
             np.float32,
-            responsibility=0.5 if config.learner_is_known else 1.0,
+            responsibility=shield_responsibility(config),
         ),
         range_sq=np.float32(config.outer_radius_m) ** 2,
     )

@@ -28,6 +28,8 @@ from learner.run_folder import RunFolder, find_run
 from learner.tracking.mlflow_run import git_commit
 from learner.update.networks import acting_network
 from sim_core.checks import require
+from sim_core.config import WorldConfig
+from sim_core.shield import shield_responsibility
 
 FORMAT = "shoal-policy-1"
 
@@ -89,6 +91,19 @@ def _exportable(command: Export, config: RunConfig, weights: WeightsSnapshot) ->
     return _Exportable(robot, robot.inputs(world), robot.outputs(world), states)
 
 
+def shield_numbers(world: WorldConfig) -> dict[str, Any]:
+    """What a robot needs for its shield (deploy/examples/shield.py), and whether the policy is used with one."""
+    return {
+        "used": world.shield == "orca",
+        "radius_m": world.robot_radius_m + world.shield_margin_m,
+        "horizon_s": world.shield_horizon_s,
+        "range_m": world.outer_radius_m,
+        "time_step_s": world.time_step_s,
+        "responsibility": shield_responsibility(world),
+        "top_speed_m_s": world.method_class.top_speed_m_s(world),
+    }
+
+
 def metadata(config: RunConfig, weights: WeightsSnapshot, bare: bool) -> dict[str, Any]:
     """The metadata of an exported file, in addition to its inputs and outputs."""
     world = config.world
@@ -99,6 +114,7 @@ def metadata(config: RunConfig, weights: WeightsSnapshot, bare: bool) -> dict[st
         "time_step_s": world.time_step_s,
         "decision_interval_steps": world.decision_interval_steps,
         "outer_radius_m": world.outer_radius_m,
+        "shield": shield_numbers(world),
     }
     origin = {"run": config.name, "config_hash": config_hash(config), "updates": weights.version}
     settings = {"commit": git_commit(), "settings": to_dict(config)}

@@ -7,6 +7,7 @@ positions come from its sensors and teammates, the velocity goes to its motors, 
 """
 
 import json
+import runpy
 import sys
 import time
 from pathlib import Path
@@ -14,6 +15,8 @@ from typing import Any
 
 import numpy as np
 import onnxruntime
+
+shielded = runpy.run_path(str(Path(__file__).with_name("shield.py")))["shielded"]
 
 
 def load(folder: Path) -> tuple[Any, dict[str, Any]]:
@@ -49,17 +52,23 @@ def main(folder: Path, seconds: float = 12.0, walk_m_s: float = 0.5) -> None:
     starts = 6.0 * np.stack([turn(np.arange(count) * 2 * np.pi / count) for turn in (np.cos, np.sin)], axis=1)
     groups = starts[:, None] + np.random.default_rng(0).uniform(-0.7, 0.7, (count, 6, 2))
     robot, goals, spent_s, action = starts[0].copy(), -starts, 0.0, np.array([-1])
+    walk, driven = walk_m_s * goals / np.linalg.norm(goals, axis=1, keepdims=True), np.zeros(2)
     for tick in range(round(seconds / tick_s)):
         decides, begin_s = tick % about["decision_interval_steps"] == 0, time.perf_counter()
         if decides or about["method"] == "out":  # M_OUT's potential field acts between decisions, too
             held = -1 if decides else int(action[0])
             velocity, action = policy.run(["velocity", "action"], sense(about["method"], robot, groups, goals, held))
+        if about["shield"]["used"]:
+            others, theirs = (groups - robot).reshape(-1, 2), np.repeat(walk, groups.shape[1], axis=0)
+            driven = shielded(velocity[0], driven, others, theirs, about["shield"])
+        else:
+            driven = velocity[0]
         spent_s += time.perf_counter() - begin_s
-        robot += velocity[0] * tick_s
-        groups += walk_m_s * tick_s * (goals / np.linalg.norm(goals, axis=1, keepdims=True))[:, None]
+        robot += driven * tick_s
+        groups += tick_s * walk[:, None]
         if tick % round(1 / tick_s) == 0:
             away_m = np.linalg.norm(robot - groups[0].mean(axis=0))
-            print(f"{tick * tick_s:.0f} s: drives {velocity[0].round(2)} m/s, {away_m:.2f} m from its group")
+            print(f"{tick * tick_s:.0f} s: drives {driven.round(2)} m/s, {away_m:.2f} m from its group")
     print(f"{1e6 * spent_s / (tick + 1):.0f} us a tick")
 
 

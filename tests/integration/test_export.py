@@ -77,7 +77,22 @@ def test_the_example_runs_on_numpy_and_onnxruntime_alone(exported, tmp_path):
     assert len(lines) == 13 and lines[-1].endswith("us a tick")
     velocities = [np.array(line.split("[")[1].split("]")[0].split(), float) for line in lines[:-1]]
     np.testing.assert_allclose(np.linalg.norm(velocities, axis=1), 1.0, atol=0.02)
-    assert len(EXAMPLE.read_text().splitlines()) <= 66
+    assert len(EXAMPLE.read_text().splitlines()) <= 75
+
+
+def test_the_example_drives_with_a_shield_where_the_policy_does(exported, tmp_path):
+    shutil.copytree(exported, tmp_path / "e")
+    about = json.loads((tmp_path / "e" / "policy.json").read_text())
+    assert about["shield"]["used"] is False and about["shield"]["top_speed_m_s"] == 1.0
+    about["shield"]["used"] = True
+    (tmp_path / "e" / "policy.json").write_text(json.dumps(about))
+    driven = []
+    for folder in (exported, tmp_path / "e"):
+        command = [sys.executable, "-I", "-W", "error", str(EXAMPLE), str(folder)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        driven.append(done.stdout.splitlines()[:-1])
+    assert driven[0] != driven[1], "the robot meets robots that its policy runs into"
 
 
 def test_the_example_refuses_an_export_that_answers_otherwise(exported, tmp_path):
