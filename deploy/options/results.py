@@ -172,7 +172,7 @@ class Dashboard:
     """Show a sweep or a run as an HTML report with playable episodes: one file, or a page that follows it live."""
 
     source: Positional[str]
-    """A sweep (its name, its folder or a results.csv), or a run (its name or its folder)."""
+    """A sweep (its name, its folder or a results.csv), a search or a run (its name or its folder)."""
     out: Path | None = None
     """File to write; dashboard.html beside the results by default."""
     serve: Switch = 0
