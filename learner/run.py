@@ -110,7 +110,7 @@ class RunSession:
                 self._log(result, result.evaluation, rows, finish)
             status = "FINISHED" if result.stopped_by is None else "KILLED"
             return result
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit):  # the latter where a search ends a trial early
             status = "KILLED"
             raise
         finally:
