@@ -34,7 +34,21 @@ from sim_core.checks import ConfigError, require, require_packages  # noqa: E402
 FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
-Command = Train | Sweep | Search | Report | Resume | Evaluate | Stress | Watch | Chaos | Export | Submit | Dashboard | Relocate
+Command = (
+    Train
+    | Sweep
+    | Search
+    | Report
+    | Resume
+    | Evaluate
+    | Stress
+    | Watch
+    | Chaos
+    | Export
+    | Submit
+    | Dashboard
+    | Relocate
+)
 COMMANDS: dict[type[Command], str] = {
     Train: "train",
     Sweep: "sweep",
