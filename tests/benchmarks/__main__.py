@@ -22,6 +22,7 @@ BENCHMARKS = (
     "export",
     "checkpoints",
     "user_methods",
+    "foreign_envs",
     "senses",
 )
 
