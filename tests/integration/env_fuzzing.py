@@ -250,8 +250,10 @@ def env_workplace(folder: Path) -> Iterator[None]:
         patch.setattr(deploy.runs.artifacts, "learning_curve_png", lambda points, path, *more: path.touch())
         patch.setattr(evaluator, "MAX_EPISODE_STEPS", LONGEST)
         patch.setattr(ReplayShard, "add", checked)
-        yield
-    gym.registry.pop(ENV_ID)
+        try:
+            yield
+        finally:
+            gym.registry.pop(ENV_ID)
 
 
 def check_env(case: Case) -> Found:
