@@ -24,6 +24,7 @@ BENCHMARKS = (
     "user_methods",
     "foreign_envs",
     "senses",
+    "shield",
 )
 
 
