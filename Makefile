@@ -86,7 +86,8 @@ reproduce: $(READY)
 generalist: $(READY)
 	$(BIN)/python -m tests.benchmarks.generalist $(ARGS)
 
-# Over ten thousand random command lines and config files. ARGS="--share 0.1" for some, ARGS="--seed 1" for others.
+# Over ten thousand random command lines and config files, and 2,000 environments. ARGS="--share 0.1" for some,
+# ARGS="--seed 1" for others, ARGS="--kinds environments" for one kind.
 fuzz: $(READY)
 	$(BIN)/python -m tests.benchmarks.fuzz $(ARGS)
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from dashboards.analysis.aggregate import CELLS_PER_METHOD, Results
 from dashboards.analysis.claim_checks import Claim, Verdict, with_verdict
-from dashboards.analysis.claim_text import NOTE, table_of, tally, verdict_table
+from dashboards.analysis.claim_text import NOTE, contradictions, table_of, tally, verdict_table
 from dashboards.analysis.comparison import BASELINES_NOTE, comparison_rows
 from dashboards.analysis.methods import in_order
 from dashboards.figures.diagrams import DIAGRAMS
@@ -53,6 +53,8 @@ def report_markdown(
     lines += [NOTE, "", "Every check with its numbers: [claims.md](claims.md).", ""]
     for section in sections:
         lines += _preset_section(section)
+    lines += ["## Claims that contradict each other", ""]
+    lines += [*contradictions({section.name: section.claims for section in sections}), ""]
     where = f"Drawn from worlds of preset {sections[0].name}, where its settings fit the drawn method and setup."
     lines += ["## How it works", "", where, ""]
     for drawing in DRAWINGS:

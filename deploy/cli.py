@@ -25,7 +25,7 @@ import tyro  # noqa: E402
 
 from actors.service.fault_policy import RunFailed  # noqa: E402
 from deploy.options.results import Dashboard, Evaluate, Export, Relocate, Report, Stress, Watch  # noqa: E402
-from deploy.options.training import Chaos, Resume, Submit, Sweep, Train, ray_address  # noqa: E402
+from deploy.options.training import Chaos, Resume, Search, Submit, Sweep, Train, ray_address  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
 from learner.presets import TrainingPreset, preset_config  # noqa: E402
 from learner.ray_backend.auth import guard_ray  # noqa: E402
@@ -34,10 +34,25 @@ from sim_core.checks import ConfigError, require, require_packages  # noqa: E402
 FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
-Command = Train | Sweep | Report | Resume | Evaluate | Stress | Watch | Chaos | Export | Submit | Dashboard | Relocate
+Command = (
+    Train
+    | Sweep
+    | Search
+    | Report
+    | Resume
+    | Evaluate
+    | Stress
+    | Watch
+    | Chaos
+    | Export
+    | Submit
+    | Dashboard
+    | Relocate
+)
 COMMANDS: dict[type[Command], str] = {
     Train: "train",
     Sweep: "sweep",
+    Search: "search",
     Report: "report",
     Resume: "resume",
     Evaluate: "evaluate",
@@ -150,7 +165,7 @@ def _split_job(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def _joins_cluster(command: Command) -> bool:
     """Whether the command connects to a Ray cluster that is running already."""
-    if isinstance(command, Train | Sweep):
+    if isinstance(command, Train | Sweep | Search):
         return command.launch.ray_address() is not None
     return isinstance(command, Submit) or (
         isinstance(command, Resume | Evaluate | Stress) and ray_address(command.address) is not None

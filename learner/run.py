@@ -106,21 +106,19 @@ class RunSession:
         try:
             with self._folder.traceback_kept(), self._guard():
                 result, rows = self._train_and_evaluate(checkpoint)
-            if result.evaluation is not None:
-                self._log(result, result.evaluation, rows, finish)
+                if result.evaluation is not None:
+                    self._log(result, result.evaluation, rows, finish)
             status = "FINISHED" if result.stopped_by is None else "KILLED"
             return result
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit):  # the latter where a search ends a trial early
             status = "KILLED"
             raise
         finally:
             self._end(status)
 
     def _guard(self) -> AbstractContextManager[None]:
-        """Keeps a foreign environment of this process from hanging or leaving it; over Ray, deadlines do."""
-        config = self._config
-        is_needed = config.engine == "process" and not config.env.is_swarm
-        return env_guard(self._options.deadline_s) if is_needed else nullcontext()
+        """Keeps a foreign environment from hanging this process or leaving it; those of Ray's actors have deadlines."""
+        return nullcontext() if self._config.env.is_swarm else env_guard(self._options.deadline_s)
 
     def _train_and_evaluate(self, checkpoint: Checkpoint | None) -> tuple[RunResult, list[Row]]:
         """Makes attempts until one succeeds; returns its result and all rows of metrics."""

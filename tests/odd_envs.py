@@ -193,6 +193,11 @@ class CannotRender(Images):
         raise NotImplementedError
 
 
+class NeverDraws(Images):
+    def render(self):
+        time.sleep(100_000)
+
+
 class DrawsNothing(Images):
     def render(self):
         return None

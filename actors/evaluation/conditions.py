@@ -49,6 +49,18 @@ def parse_axis(text: str) -> Axis:
     return Axis(name, values)
 
 
+def parse_condition(texts: Sequence[str]) -> Condition:
+    """Parses a condition, `NAME=VALUE` each.
+
+    Raises:
+      ConfigError: see `parse_axis` and `grid`; or a field has several values.
+    """
+    axes = [parse_axis(text) for text in texts]
+    for axis in axes:
+        require(len(axis.values) == 1, f"{axis.name} must have one value here; `shoal stress` plays several")
+    return grid(axes)[0]
+
+
 def grid(axes: Sequence[Axis]) -> list[Condition]:
     """All combinations of the axes' values; those of the last axis change first.
 

@@ -19,7 +19,8 @@ from actors.rollout.foreign_env import EnvInterrupted, ForeignVectorEnv
 
 SIGNAL = signal.SIGUSR1
 """Ends a call of an environment, also one that sleeps or waits."""
-CALLS = {getattr(ForeignVectorEnv, name).__code__ for name in ("_make", "step", "_first_observation", "render")}
+CALLERS = ("_make", "_spaces_of", "_first_observation", "step", "render", "close_extras")
+CALLS = {getattr(ForeignVectorEnv, name).__code__ for name in CALLERS}
 """Code of the methods that call an environment."""
 
 

@@ -9,8 +9,9 @@ Infos are the environment's own and stay there.
 from __future__ import annotations
 
 import functools
+import logging
+import math
 import traceback
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,8 +25,6 @@ from actors.rollout.foreign_spaces import Unfit, flat_space, make_encoder, shown
 from sim_core.checks import ConfigError
 from sim_core.plugins import reason_of
 
-MAX_FLOAT32 = float(np.finfo(np.float32).max)
-"""Greatest number that the replay and the network can hold."""
 REHEARSAL_STEPS = 20
 CANNOT_BE_MADE = "cannot be made by Gymnasium"
 OUTSIDE = tuple(str(Path(module).parent) for module in (gym.__file__, np.__file__, __file__))
@@ -157,7 +156,7 @@ class ForeignVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDA
         self._check_finite(observation, reward)
         if infos:
             infos["_final_obs"] = terminated | truncated
-            self._check_finite(infos["final_obs"][infos["_final_obs"]])
+            self._check_finite(infos["final_obs"])
         return observation, reward, terminated, truncated, infos
 
     def render(self) -> tuple[Any, ...]:
@@ -172,10 +171,17 @@ class ForeignVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDA
             raise self._raised("render", error) from error
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Closes every environment; what one raises then is of no use to anybody."""
+        """Closes every environment; what one does instead is of no use to anybody."""
         for env in self.envs:
-            with suppress(Exception, SystemExit):
+            try:
                 env.close()
+            except KeyboardInterrupt:
+                raise
+            except BaseException:
+                logging.getLogger(__name__).debug("env_id %r cannot be closed", self.env_id, exc_info=True)
+
+    def __del__(self) -> None:
+        """Does nothing: an environment's code runs only when it is called."""
 
     def _empty(self) -> NDArray[Any]:
         return np.zeros(self._shape, self.single_observation_space.dtype)
@@ -230,10 +236,10 @@ class ForeignVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDA
         return bool(array)
 
     def _check_finite(self, observation: NDArray[Any], reward: NDArray[np.float64] | None = None) -> None:
-        """Refuses numbers that are not finite in float32, in one pass over each array."""
-        if reward is not None and not np.abs(reward).max() <= MAX_FLOAT32:
+        """Refuses numbers that are not finite in float32."""
+        if reward is not None and not _are_finite(reward):
             raise self._refused(f"step() gave the reward {_first_bad(reward)}, which is not finite in float32")
-        if self._is_float and not np.abs(observation).max() <= MAX_FLOAT32:
+        if self._is_float and not _are_finite(observation):
             raise self._refused(
                 f"it gave an observation with {_first_bad(observation)}, which is not finite in float32"
             )
@@ -263,8 +269,21 @@ def _as_array(value: Any) -> NDArray[Any] | None:
         return None
 
 
+def _are_finite(values: NDArray[Any]) -> bool:
+    """Whether float32 holds all values: by the sum of their squares, and one by one only where that is large."""
+    flat = values.reshape(-1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return math.isfinite(np.dot(flat, flat).astype(np.float32)) or bool(_held(flat).all())
+
+
+def _held(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which values are finite in float32."""
+    with np.errstate(over="ignore"):
+        return np.isfinite(values.astype(np.float32))
+
+
 def _first_bad(values: NDArray[Any]) -> float:
-    return float(values[~(np.abs(values) <= MAX_FLOAT32)][0])
+    return float(values[~_held(values)][0])
 
 
 def _place(error: BaseException) -> str:
@@ -274,18 +293,23 @@ def _place(error: BaseException) -> str:
 
 
 @functools.lru_cache(maxsize=64)
-def rehearse_env(env_id: str) -> None:
+def rehearse_env(env_id: str) -> tuple[gym.spaces.Box, gym.spaces.Discrete]:
     """Plays a few steps of an environment, so that what is wrong with it shows before anything else starts.
+
+    Returns:
+      Its spaces of observations, flattened, and of actions.
 
     Raises:
       EnvError: see the module.
     """
     env, rng = ForeignVectorEnv(env_id, 1), np.random.default_rng(0)
-    assert isinstance(env.single_action_space, gym.spaces.Discrete)
+    observations, actions = env.single_observation_space, env.single_action_space
+    assert isinstance(observations, gym.spaces.Box) and isinstance(actions, gym.spaces.Discrete)
     try:
         env.reset(seed=[0])
         for _ in range(REHEARSAL_STEPS):
-            env.step(rng.integers(env.single_action_space.n, size=1))
+            env.step(rng.integers(actions.n, size=1))
         env.reset()
     finally:
         env.close()
+    return observations, actions

@@ -71,7 +71,8 @@ def make_encoder(space: gym.Space[Any], flat: spaces.Box) -> Encoder:
 
     def encode(value: Any) -> NDArray[Any]:
         _check(space, value)
-        return np.asarray(spaces.utils.flatten(space, value)).astype(flat.dtype)
+        with np.errstate(over="ignore"):  # as in `_as_dtype`
+            return _as_dtype(np.asarray(spaces.utils.flatten(space, value)), flat.dtype)
 
     return encode
 
@@ -106,4 +107,10 @@ def _array(space: spaces.Box, value: Any) -> NDArray[Any]:
         raise Unfit(f"an observation of shape {array.shape}, where observation_space has {space.shape}")
     if not np.can_cast(array.dtype, space.dtype, "same_kind"):
         raise Unfit(f"an observation of dtype {array.dtype}, where observation_space has {space.dtype}")
-    return array
+    return _as_dtype(array, space.dtype)
+
+
+def _as_dtype(array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """`array` in another dtype; a number that it does not hold becomes infinite, which is found out later."""
+    with np.errstate(over="ignore"):
+        return array.astype(dtype, copy=False)

@@ -148,6 +148,10 @@ class RolloutNode:
         ref = self._calls.start(self._shards[shard], PushTarget.add, block)
         return _Push(block, shard, self._shard_incarnations[shard], attempt, ref)
 
+    def close(self) -> None:
+        """Closes the worker's environments."""
+        self._worker.close()
+
     def settle(self) -> list[BlockReport]:
         """Waits for every push in flight; returns their reports."""
         self._watch.lap(WAITS)

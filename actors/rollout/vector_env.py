@@ -106,14 +106,15 @@ class EnvShape(NamedTuple):
 
 
 def env_shape(spec: EnvSpec) -> EnvShape:
-    """Spaces of `spec`, read from one environment that is made for this; whatever is a user's own is rehearsed first.
+    """Spaces of `spec`, read from one environment that is made for this; whatever is a user's own is rehearsed.
 
     Raises:
       ConfigError: see `make_vector_env`; also if the rehearsal finds an error in the user's code.
     """
     if not spec.is_swarm:
-        rehearse_env(spec.env_id)
-    for world in spec.worlds if spec.is_swarm else []:
+        observations, actions = rehearse_env(spec.env_id)
+        return EnvShape(observations, int(actions.n))
+    for world in spec.worlds:
         rehearse(world)
     env = make_vector_env(spec, len(spec.worlds))
     try:

@@ -136,6 +136,10 @@ class RolloutWorker:
             self._length[done] = 0
             self._return[done] = 0.0
 
+    def close(self) -> None:
+        """Closes the environments."""
+        self._env.close()
+
     def get_state(self) -> dict[str, Any]:
         """Everything that a checkpoint needs: `arrays` by name, and `meta` for JSON.
 

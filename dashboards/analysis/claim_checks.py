@@ -76,6 +76,14 @@ class Check(NamedTuple):
             return Verdict.HOLDS
         return Verdict.FAILS if high < self.low or low > self.high else Verdict.UNDECIDED
 
+    @property
+    def distance(self) -> float | None:
+        """How far the value is outside the range, as a share; 0 inside, None without data."""
+        if self.measured is None:
+            return None
+        value = self.measured.estimate.value
+        return max(self.low - value, value - self.high, 0.0)
+
 
 class Claim(NamedTuple):
     """One of the dissertation's claims with its checks."""
@@ -90,6 +98,20 @@ class Claim(NamedTuple):
         found = {check.verdict for check in self.checks}
         worst_first = (Verdict.FAILS, Verdict.NO_DATA, Verdict.UNDECIDED)
         return next((verdict for verdict in worst_first if verdict in found), Verdict.HOLDS)
+
+
+def distance(claims: Sequence[Claim]) -> float | None:
+    """The sum over the dissertation's claims of the mean distance of their checks from their ranges, as a share.
+
+    Checks without data are left out, and further statements; None where no check has data.
+    """
+    distances = [
+        [check.distance for check in claim.checks if check.distance is not None]
+        for claim in claims
+        if claim.number <= NUM_CLAIMS
+    ]
+    known = [sum(each) / len(each) for each in distances if each]
+    return sum(known) if known else None
 
 
 def about(name: str, measured: Measurement | None, value: float, tolerance: float = ABOUT) -> Check:

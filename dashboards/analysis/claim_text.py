@@ -91,7 +91,7 @@ def claims_markdown(judged: dict[str, list[Claim]]) -> str:
     for preset, claims in judged.items():
         lines += [f"## Preset {preset}", "", f"{tally(claims).capitalize()}.", "", *verdict_table(claims), ""]
         lines += details(claims)
-    lines += ["## Which contradict each other", "", *contradictions(judged)]
+    lines += ["## Claims that contradict each other", "", *contradictions(judged)]
     return "\n".join(lines).rstrip("\n") + "\n"
 
 

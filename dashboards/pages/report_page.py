@@ -30,7 +30,8 @@ from dashboards.plotly_charts.result_charts import FAVOURITE
 
 REFRESH_S = 4
 """Interval at which a served page requests newer data."""
-FIRST, LAST = ("running", "success", "claims"), ("transfer", "failures", "curves", "throughput")
+SEARCH = ("search", "front", "importances", "slices")
+FIRST, LAST = ("running", *SEARCH, "success", "claims"), ("transfer", "failures", "curves", "throughput")
 """First and last sections of a report; other tables come between, and the episodes at the end."""
 
 

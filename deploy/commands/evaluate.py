@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
+from actors.evaluation.conditions import parse_condition
 from actors.evaluation.evaluation_store import StoredEvaluation, refuse_existing, save_evaluation
 from actors.evaluation.evaluator import record_episode
 from actors.evaluation.trajectory import save_episodes
@@ -19,7 +20,7 @@ from deploy.console.summary_tables import compared, evaluation_table, setups_tab
 from deploy.console.terminal import plain_console
 from deploy.options.results import Evaluate
 from deploy.options.training import ray_address
-from deploy.playing.players import Target, check_same_starts, find_players
+from deploy.playing.players import Target, check_same_starts, find_players, under
 from deploy.runs.folders import make_folder
 from learner.ray_backend.cluster import evaluate_in_tasks
 from learner.training.evaluation_summary import summarise
@@ -33,7 +34,8 @@ def run(command: Evaluate) -> int:
     Raises:
       ConfigError: there is no such run or policy, a flag does not apply to it, or a file to write exists.
     """
-    targets = find_players(command)
+    condition = parse_condition(command.under)
+    targets = [under(target, condition) for target in find_players(command)]
     if len(targets) > 1:
         return _compare(command, targets)
     target = targets[0]

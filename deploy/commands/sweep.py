@@ -2,40 +2,20 @@
 
 from __future__ import annotations
 
-import fcntl
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 
 from rich.console import Console
 
 from deploy.console.sweep_display import SweepDisplay, make_sweep_display
 from deploy.console.terminal import plain_console
 from deploy.options.training import Sweep
-from deploy.runs.folders import check_outlasts_job, check_plain_name, default_sweep_name
+from deploy.runs.folders import check_outlasts_job, check_plain_name, default_sweep_name, locked
 from deploy.runs.sweep_results import SweepResults
-from learner.file_names import CELLS, LOCK, SWEEPS
+from learner.file_names import CELLS, SWEEPS
 from learner.sweep.cell import SweepLocation
 from learner.sweep.grid import Cell
 from learner.sweep.tune import run_cells
 from learner.tracking.mlflow_run import Tracker
-from sim_core.checks import ConfigError
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Locks the sweep's folder, so that no two commands run its cells at once.
-
-    Raises:
-      ConfigError: another command holds it.
-    """
-    with (folder / LOCK).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ConfigError(f"another `shoal sweep` is at work in {folder}; wait for it or end it") from error
-        yield
 
 
 class _Listener:
@@ -78,7 +58,7 @@ def run(command: Sweep) -> int:
     console.print(f"sweep {folder}", soft_wrap=True)
     if results.left_out:
         console.print(f"{results.left_out} rows of {command.known} are of other settings and left out", soft_wrap=True)
-    with _locked(folder):
+    with locked(folder, "sweep"):
         done = results.write()
         display = make_sweep_display(console, results.cells, done)
         missing = [cell for cell in results.cells if cell.key not in done]
@@ -89,7 +69,7 @@ def run(command: Sweep) -> int:
 
 def _run_missing(command: Sweep, name: str, results: SweepResults, missing: list[Cell], display: SweepDisplay) -> None:
     launch = command.launch
-    location = SweepLocation(results.folder / CELLS, launch.tracking(), launch.sweep_experiment(name))
+    location = SweepLocation(results.folder / CELLS, launch.tracking(), launch.experiment_of("sweep", name))
     # Makes the store and the experiment here, before several processes open them.
     Tracker(location.tracking_uri, location.experiment, launch.artifact_root()).set_views()
     results.record_provenance()

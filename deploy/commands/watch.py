@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
 from pathlib import Path
 
+from actors.evaluation.conditions import parse_condition, world_under
 from actors.evaluation.evaluator import record_episode
 from actors.evaluation.trajectory import save_episodes
 from actors.policy.policy import WeightsSnapshot
@@ -31,6 +33,9 @@ def run(command: Watch) -> int:
     """
     folder = find_run(command.run, command.runs_dir)
     config = folder.config()
+    if condition := parse_condition(command.under):
+        require(config.env.is_swarm, f"--under sets conditions of our own environment, not of {config.env_id}")
+        config = dataclasses.replace(config, world=world_under(config.world, condition))
     if command.live:
         return serve_until_interrupted(live_server(folder, config, command.seed, command.port))
     if command.format == "mp4":

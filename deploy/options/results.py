@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseCounterAction, arg
 
-from actors.evaluation.conditions import grid, parse_axis
+from actors.evaluation.conditions import grid, parse_axis, parse_condition
 from learner.presets import PresetName
 from sim_core.checks import require
 
@@ -71,6 +71,8 @@ class Evaluate(Players):
     Several players meet the same start scenes; their differences to the first are paired.
     """
 
+    under: tuple[str, ...] = ()
+    """Conditions to play under alone, NAME=VALUE, as in `shoal stress --vary`; as trained by default."""
     out: Path | None = None
     """New .zarr file for the results: seed, outcome, length and return of every episode."""
     record: int = 0
@@ -78,6 +80,7 @@ class Evaluate(Players):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        parse_condition(self.under)
         require(len(self.run) == 1 or self.out is None, "--out stores the results of one player; evaluate it alone")
         require(
             0 <= self.record <= self.episodes,
@@ -125,6 +128,8 @@ class Watch:
     """Page with a player, video, or strip of frames; for other environments than ours, video only."""
     seed: int = 2_000_000_000
     """Seed of the episode."""
+    under: tuple[str, ...] = ()
+    """Conditions to play under alone, NAME=VALUE, as in `shoal stress --vary`; as trained by default."""
     out: Path | None = None
     """File to write; `episode-SEED` in the run's artifacts by default."""
     live: Switch = 0
@@ -137,6 +142,7 @@ class Watch:
     """Folder of all runs."""
 
     def __post_init__(self) -> None:
+        parse_condition(self.under)
         require(0 <= self.seed < 2**32, f"--seed must be in 0..{2**32 - 1}, not {self.seed}")
         _check_port(self.port)
         require(
@@ -172,7 +178,7 @@ class Dashboard:
     """Show a sweep or a run as an HTML report with playable episodes: one file, or a page that follows it live."""
 
     source: Positional[str]
-    """A sweep (its name, its folder or a results.csv), or a run (its name or its folder)."""
+    """A sweep (its name, its folder or a results.csv), a search or a run (its name or its folder)."""
     out: Path | None = None
     """File to write; dashboard.html beside the results by default."""
     serve: Switch = 0

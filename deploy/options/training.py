@@ -9,9 +9,12 @@ from typing import Literal
 
 from tyro.conf import Fixed, Positional, Suppress
 
+from deploy.options.results import Switch
 from learner.cluster_options import DEADLINE_S, START_DEADLINE_S, ClusterOptions
 from learner.config import RunConfig
 from learner.presets import TrainingPreset
+from learner.search.config import SearchConfig
+from learner.search.space import FORMS
 from learner.sweep.grid import SweepConfig
 from learner.tracking.local_store import ARTIFACTS, DATABASE, sqlite_uri
 from learner.tracking.redaction import VARIABLE
@@ -73,9 +76,9 @@ class Launch(RayOptions):
         """Artifact folder of a new experiment: beside a local database; None leaves the choice to the server."""
         return str(self.runs_dir.absolute() / ARTIFACTS) if self.tracking().startswith("sqlite:") else None
 
-    def sweep_experiment(self, name: str) -> str:
-        """MLflow experiment of the sweep `name`: the given one, or one of its own."""
-        return f"sweep {name}" if self.experiment == type(self).experiment else self.experiment
+    def experiment_of(self, kind: str, name: str) -> str:
+        """MLflow experiment of the sweep or search `name`: the given one, or one of its own."""
+        return f"{kind} {name}" if self.experiment == type(self).experiment else self.experiment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +118,24 @@ class Sweep:
     """Results of an earlier sweep (a results.csv); cells that it holds in full are not run again."""
 
     def __post_init__(self) -> None:
+        require(self.at_once is None or self.at_once >= 1, f"--at-once must be at least 1, not {self.at_once}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """Search settings for objectives with Optuna; after a kill, the same command goes on."""
+
+    search: SearchConfig = field(default_factory=SearchConfig)
+    """What to vary, and what for."""
+    launch: Launch = field(default_factory=Launch)
+    """Where; the name is that of the search, what it varies by default."""
+    at_once: int | None = None
+    """Trials run at once; one per CPU of the cluster by default."""
+    dry_run: Switch = 0
+    """Say how long the search will take, from rates measured here, and run nothing."""
+
+    def __post_init__(self) -> None:
+        require(len(self.search.space) > 0, f"name what to vary, as in --space {FORMS.replace(', ', ' ', 1)}")
         require(self.at_once is None or self.at_once >= 1, f"--at-once must be at least 1, not {self.at_once}")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
+from actors.evaluation.conditions import Condition, world_under
 from actors.evaluation.evaluator import Candidate
 from actors.policy.baselines import Baseline, check_exists
 from actors.rollout.vector_env import EnvSpec
@@ -54,6 +55,20 @@ def _baseline_spec(command: Players) -> EnvSpec:
 def _baseline(spec: EnvSpec, baseline: Baseline) -> Target:
     check_exists(baseline, spec.world)
     return Target(spec, baseline, str(baseline), 0, f"{baseline}, {spec.world.method_name} {spec.world.setup}", None)
+
+
+def under(target: Target, condition: Condition) -> Target:
+    """The player under a condition alone; as it is if the condition is empty.
+
+    Raises:
+      ConfigError: it plays another environment than ours, or a value cannot be.
+    """
+    if not condition:
+        return target
+    spec = target.spec
+    require(spec.is_swarm, f"--under sets conditions of our own environment, not of {spec.env_id}")
+    shares = tuple((world_under(world, condition), share) for world, share in spec.shares)
+    return target._replace(spec=EnvSpec(spec.env_id, world_under(spec.world, condition), shares))
 
 
 def check_same_starts(targets: list[Target]) -> None:

@@ -1,4 +1,4 @@
-"""Finds what a report is about: a sweep, a table of results, or a run."""
+"""Finds what a report is about: a sweep, a search, a table of results, or a run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ReportSource(Protocol):
 
 
 def find_report_source(name: str, runs_dir: Path) -> ReportSource:
-    """The sweep or run that a user names: by a table of results, a folder, or a name under `runs_dir`.
+    """The sweep, search or run that a user names: by a table of results, a folder, or a name under `runs_dir`.
 
     Raises:
       ConfigError: there is none.
@@ -43,6 +43,11 @@ def find_report_source(name: str, runs_dir: Path) -> ReportSource:
             (folder / file_names.CELLS).is_dir() or (folder / file_names.RESULTS).is_file()
         ):
             return SweepSource(folder, folder / file_names.RESULTS)
+    for folder in (path, runs_dir / file_names.SEARCHES / name):
+        if (folder / file_names.STUDY).is_file():
+            from deploy.report_data.search_source import SearchSource  # imports Optuna
+
+            return SearchSource(folder)
     require(path.suffix != ".csv", f"there is no table of results {name}; name a sweep, its results.csv, or a run")
     try:
         run = find_run(name, runs_dir)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from actors.storage.atomic_write import replacing_file
 from actors.storage.uri import Location, check_writable, join_location, parse_location
 from learner.checkpoints.store import open_store
 from learner.config import RunConfig
+from learner.file_names import LOCK
 from learner.run_folder import Storage
 from learner.sweep.grid import SweepConfig
 from sim_core.checks import ConfigError, require
@@ -48,6 +52,21 @@ def make_folder(path: Path, flag: str) -> None:
         raise ConfigError(f"{flag} {path} cannot be made ({error}); name a folder that you may write to") from error
     may_write = os.access(path, os.W_OK, effective_ids=True)
     require(may_write, f"{flag} {path} cannot be written to; name a folder that you may write to")
+
+
+@contextmanager
+def locked(folder: Path, command: str) -> Iterator[None]:
+    """Locks the folder of a sweep or a search, so that no two commands run what is missing there at once.
+
+    Raises:
+      ConfigError: another command holds it.
+    """
+    with (folder / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ConfigError(f"another `shoal {command}` is at work in {folder}; wait for it or end it") from error
+        yield
 
 
 def run_location(checkpoint_url: str, name: str) -> Location:

@@ -38,11 +38,15 @@ from sim_core.outcomes import ENDED
 
 
 class SweepLocation(NamedTuple):
-    """Where a sweep stores its cells, and where it logs them: MLflow tracking URI and experiment."""
+    """Where a sweep stores its cells, and where it logs them: MLflow tracking URI and experiment.
+
+    `registers` says whether policies become versions of MLflow's registered models, which rank them.
+    """
 
     cells: Path
     tracking_uri: str
     experiment: str
+    registers: bool = True
 
     @property
     def sweep(self) -> str:
@@ -136,7 +140,7 @@ def run_cell(sweep: SweepConfig, cell: Cell, location: SweepLocation, on_row: Ca
         with tracker.ending():
             _evaluate_again(sweep, cell, folder, tracker)
     else:
-        _train(sweep, cell, folder, tracker, checkpoint, on_row)  # ends the MLflow run itself
+        _train(sweep, cell, folder, location, tracker, checkpoint, on_row)  # ends the MLflow run itself
     _new_table(folder).rename(folder.results)  # once MLflow has everything and the run is ended
     shutil.rmtree(folder.checkpoints, ignore_errors=True)  # the policy and the results stay
     return folder.results
@@ -146,6 +150,7 @@ def _train(
     sweep: SweepConfig,
     cell: Cell,
     folder: RunFolder,
+    location: SweepLocation,
     tracker: Tracker,
     checkpoint: Checkpoint | None,
     on_row: Callable[[Row], None],
@@ -160,7 +165,8 @@ def _train(
         save_policy(folder.policy, result.weights, cell.config, shape)
         results = _evaluate_all(sweep, cell, folder, result.weights, result.episodes)
         tracker.log_artifact(folder.policy)
-        tracker.log_policy(result.weights, cell.config, shape, score(result.evaluation))
+        if location.registers:
+            tracker.log_policy(result.weights, cell.config, shape, score(result.evaluation))
         _log_table(results, folder, tracker)
 
     RunSession(folder, cell.config, tracker, RowDisplay(on_row), ClusterOptions()).execute(checkpoint, finish)

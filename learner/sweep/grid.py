@@ -125,6 +125,11 @@ def parse_overrides(assignments: tuple[str, ...]) -> tuple[dict[str, Any], dict[
     return run, world
 
 
+def assigned(assignments: tuple[str, ...]) -> list[str]:
+    """The names of the settings that overrides set."""
+    return [text.partition("=")[0] for text in assignments]
+
+
 class Cell(NamedTuple):
     """One training of a sweep, or one baseline in one setup; `key` is unique and the name of its folder."""
 

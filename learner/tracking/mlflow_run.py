@@ -170,6 +170,13 @@ class Tracker:
         self.run_id, self.started_ms = run.info.run_id, run.info.start_time
         self.log_inputs(config)
 
+    def start_trial(self, name: str, params: dict[str, str], tags: dict[str, str]) -> None:
+        """Creates a run of a search's trial, with the settings that it varies as params."""
+        given = {"mlflow.runName": name, "mlflow.source.git.commit": self._commit} | tags
+        run = self._client.create_run(self._experiment_id, tags=given)
+        self.run_id, self.started_ms = run.info.run_id, run.info.start_time
+        self._client.log_batch(self.run_id, params=[Param(key, value) for key, value in params.items()])
+
     def log_inputs(self, config: RunConfig) -> None:
         """Logs the whole config with a user's own files, and the episodes it names; harmless to repeat."""
         params = [Param(key, _param_text(key, value)) for key, value in flat_params(config).items()]

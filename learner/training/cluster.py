@@ -190,4 +190,6 @@ class ProcessCluster(Cluster):
                 LocalCalls().start(node, Checkpointable.saved, LAST_WRITE_S)
 
     def close(self) -> None:
-        """Does nothing."""
+        """Closes the rollout workers' environments."""
+        for worker in self.workers:
+            LocalCalls().start(worker, RolloutNode.close)

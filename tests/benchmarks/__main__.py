@@ -22,7 +22,9 @@ BENCHMARKS = (
     "export",
     "checkpoints",
     "user_methods",
+    "foreign_envs",
     "senses",
+    "shield",
 )
 
 

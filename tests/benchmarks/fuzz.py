@@ -1,4 +1,4 @@
-"""`make fuzz`: over ten thousand command lines and config files at random; what came of them, or the first fault."""
+"""`make fuzz`: thousands of command lines, config files and environments at random; what came of them, or a fault."""
 
 import argparse
 import sys
@@ -9,14 +9,20 @@ from hypothesis import HealthCheck, Phase, given, seed, settings
 from rich.console import Console
 from rich.table import Table
 
-from tests.integration.fuzzing import KINDS, Counts, workplace
+from learner.ray_backend.auth import guard_ray
 
-CASES = {"command lines": 4_000, "config files": 5_000, "config files with flags": 2_000}
+guard_ray(joins=False)  # before Ray is imported
+
+from tests.integration import env_fuzzing  # noqa: E402
+from tests.integration.fuzzing import KINDS, Counts, workplace  # noqa: E402
+
+ENVIRONMENTS = "environments"
+CASES = {"command lines": 4_000, "config files": 5_000, "config files with flags": 2_000, ENVIRONMENTS: 2_000}
 
 
 def fuzz(kind: str, count: int, start: int) -> Counts:
     """Checks `count` cases of a kind; a fault comes out as an AssertionError with the smallest case that shows it."""
-    cases, check = KINDS[kind]
+    cases, check = KINDS.get(kind, (env_fuzzing.CASES, env_fuzzing.check_env))
     counts = Counts()
 
     @seed(start)
@@ -37,16 +43,17 @@ def fuzz(kind: str, count: int, start: int) -> Counts:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.fuzz", description=__doc__)
-    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS), help="what to fuzz")
+    parser.add_argument("--kinds", nargs="+", choices=list(CASES), default=list(CASES), help="what to fuzz")
     parser.add_argument("--share", type=float, default=1.0, help="share of the cases to run; default: all")
     parser.add_argument("--seed", type=int, default=0, help="other cases for every seed")
     options = parser.parse_args(arguments)
-    table = Table(title=f"fuzz of the command line, seed {options.seed}: exit code 0 or 2, one sentence, no traceback")
-    for column in ("kind", "cases", "refused (2)", "came to work or help (0)", "slowest"):
+    table = Table(title=f"fuzz, seed {options.seed}: one sentence where something is refused, no traceback")
+    for column in ("kind", "cases", "refused", "came to work or help", "slowest"):
         table.add_column(column, justify="right")
     total = 0
-    with tempfile.TemporaryDirectory() as folder, workplace(Path(folder)):
-        for kind in options.kinds:
+    for kind in options.kinds:
+        place = env_fuzzing.env_workplace if kind == ENVIRONMENTS else workplace
+        with tempfile.TemporaryDirectory() as folder, place(Path(folder)):
             found = fuzz(kind, max(1, round(CASES[kind] * options.share)), options.seed)
             cases, refused = found.outcomes.total(), found.outcomes["refused"]
             table.add_row(kind, f"{cases:,}", f"{refused:,}", f"{cases - refused:,}", f"{found.slowest_s:.2f} s")

@@ -28,6 +28,7 @@ def test_presets_are_those_with_a_learned_policy_and_thesis_comes_first():
 def test_the_page_states_its_sources_and_coverage():
     rows = [*claimed_table(), fixed("sensor", Setup(5, 1))._replace(seed=1, episodes=3000)]
     page = report_markdown(["results.csv"], [section("thesis", rows)])
+    assert "| 7, 21 | 10r×8g is below 80 % (7) and above 80 % (21) | 7 holds; 21 does not hold |" in page
     assert "`results.csv`" in page and "Presets side by side" not in page
     assert "| thesis | 75 | 29 | 1 … 2 | 315,000 |" in page
 

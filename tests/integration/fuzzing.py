@@ -109,19 +109,17 @@ def _too_long(number: int, frame: Any) -> NoReturn:
     raise Hang
 
 
-def check(arguments: Sequence[str], config: bytes | None = None) -> Found:
-    """Runs one case.
+class Ended(NamedTuple):
+    """How a command ended: exit code, or WorkStarted; what it printed; seconds."""
 
-    Args:
-      arguments: the command line.
-      config: content of CONFIG_FILE, None to leave it out.
+    code: object
+    out: str
+    error: str
+    seconds: float
 
-    Raises:
-      AssertionError: another exit code than 0 or 2, no message, a traceback, or more than one sentence of ours.
-      Hang: it took too long.
-    """
-    if config is not None:
-        Path(CONFIG_FILE).write_bytes(config)
+
+def run_command(arguments: Sequence[str]) -> Ended:
+    """Runs `shoal` in this process; raises Hang if it takes too long."""
     out, err = io.StringIO(), io.StringIO()
     before = signal.signal(signal.SIGALRM, _too_long)
     signal.setitimer(signal.ITIMER_REAL, HANG_S)
@@ -136,13 +134,29 @@ def check(arguments: Sequence[str], config: bytes | None = None) -> Found:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
-    seconds, error = time.perf_counter() - start_s, err.getvalue()
+    return Ended(code, out.getvalue(), err.getvalue(), time.perf_counter() - start_s)
+
+
+def check(arguments: Sequence[str], config: bytes | None = None) -> Found:
+    """Runs one case.
+
+    Args:
+      arguments: the command line.
+      config: content of CONFIG_FILE, None to leave it out.
+
+    Raises:
+      AssertionError: another exit code than 0 or 2, no message, a traceback, or more than one sentence of ours.
+      Hang: it took too long.
+    """
+    if config is not None:
+        Path(CONFIG_FILE).write_bytes(config)
+    code, out, error, seconds = run_command(arguments)
     if code is WorkStarted:
         return Found("accepted", seconds)
     assert code in (0, BAD_INPUT), f"exit code {code}: {error}"
     assert "Traceback" not in error, error
     if code == 0:
-        assert out.getvalue(), "neither work nor help"
+        assert out, "neither work nor help"
         return Found("help", seconds)
     assert error.strip(), "refused without a word"
     if error.startswith("shoal: "):

@@ -85,6 +85,17 @@ def test_a_baseline_plays_in_a_presets_world(folder):
     assert load_evaluation(folder / "e.zarr").spec.world == preset_config("thesis", "out", 5, 2).world
 
 
+def test_conditions_hold_alone_whatever_a_policy_was_trained_with(folder):
+    trained = dataclasses.replace(SMALL.world, position_loss=0.9, conditions="drawn")
+    make_run(world=trained)
+    arguments = ["--episodes", "4", "--under", "position_delay_steps=4", "shield=orca", "--out", "e.zarr"]
+    assert main(["evaluate", "r", *arguments]) == 0
+    stored = load_evaluation(folder / "e.zarr")
+    assert stored.spec.world == dataclasses.replace(SMALL.world, position_delay_steps=4, shield="orca")
+    assert main(["evaluate", "r", "--episodes", "4", "--out", "trained.zarr"]) == 0
+    assert load_evaluation(folder / "trained.zarr").spec.world == trained
+
+
 def test_a_baseline_plays_the_dissertations_setup_by_default(capsys):
     assert main(["evaluate", "random", "--episodes", "2"]) == 0
     assert "random, sensor 10r×2g: 2 episodes" in capsys.readouterr().out
@@ -124,6 +135,9 @@ def test_a_baselines_name_is_taken_and_a_run_of_that_name_is_named_as_a_folder(c
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (["r", "--under", "position_loss=0,1"], ["position_loss must have one value here"]),
+        (["r", "--under", "position_loss=2"], ["position_loss must be between 0 and 1, not 2.0"]),
+        (["r", "--under", "horizon_steps=2"], ["'horizon_steps' is no condition"]),
         (["r", "--preset", "best"], ["--preset", "'r' has a preset of its own"]),
         (["r", "--checkpoint", "step-7"], ["no checkpoint 'step-7'", "there are: none"]),
         (

@@ -95,9 +95,9 @@ def test_what_comes_later_ends_the_run_with_a_sentence(train, name):
     assert status == "FAILED" and not any(name in model for model in models)
 
 
-@pytest.mark.parametrize("name", ["DrawsGrey", "OwnOutcome", "Parts"])
+@pytest.mark.parametrize("name", ["DrawsGrey", "NeverDraws", "OwnOutcome", "Parts"])
 def test_what_is_only_unusual_is_trained_to_the_end(train, name):
-    code, out, _, folder = train(name)
+    code, out, _, folder = train(name, "--deadline-s", "2")
     assert code == 0 and state_of(folder)[0] == "FINISHED"
     assert len([line for line in out.splitlines() if line.startswith("no animation: ")]) == 1
     assert main(["watch", str(folder.path), "--format", "mp4"]) == 2

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import FlattenObservation
 
-from actors.rollout.foreign_env import EnvError, ForeignVectorEnv, rehearse_env
+from actors.rollout.foreign_env import EnvError, ForeignVectorEnv, _are_finite, rehearse_env
 from sim_core.checks import ConfigError
 from tests.odd_envs import Plain
 
@@ -129,6 +129,15 @@ def test_an_array_that_the_environment_uses_again_is_copied():
     seen = [first[0, 0], *(step[0][0, 0] for step in steps)]
     np.testing.assert_allclose(np.diff(seen), [*[0.01] * 19, 0.02], rtol=1e-4)
     np.testing.assert_allclose(steps[-1][4]["final_obs"][0, 0], seen[-1] - 0.01, rtol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+@pytest.mark.parametrize("value", [0.0, -1.5, 6e4, 3e38, -3e38, 4e38, 1e300, np.inf, -np.inf, np.nan])
+def test_exactly_what_float32_holds_is_finite(dtype, value, recwarn):
+    with np.errstate(over="ignore"):
+        values = np.array([[1.0, 2.0], [value, 0.0]], dtype)
+        expected = np.isfinite(values.astype(np.float32)).all()
+    assert _are_finite(values) == expected and not recwarn
 
 
 BROKEN = {"broken_syntax": ("def", "SyntaxError"), "broken_import": ("1 / 0", "ZeroDivisionError")}

@@ -90,4 +90,5 @@ def test_an_observation_that_is_none_of_its_space_is_refused(space, value, words
 @pytest.mark.parametrize("value", [[0.5, 2.0], (1, 0), np.array([7, -7]), np.array([0.5, 0.1])])
 def test_numbers_of_another_type_or_beyond_the_limits_are_taken(value):
     array = make_encoder(BOX, BOX)(value)
-    np.testing.assert_array_equal(array, value)
+    np.testing.assert_array_equal(array, np.asarray(value, np.float32))
+    assert array.dtype == np.float32

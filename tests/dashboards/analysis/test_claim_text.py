@@ -68,7 +68,7 @@ def test_page_has_each_preset():
     line = (
         "| 7, 21 | 10r×8g is below 80 % (7) and above 80 % (21) | 7 holds; 21 does not hold | 7 no data; 21 no data |"
     )
-    assert line in page[page.index("## Which contradict each other") :]
+    assert line in page[page.index("## Claims that contradict each other") :]
 
 
 def test_a_vertical_bar_in_a_name_breaks_no_table():
