@@ -12,7 +12,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -114,8 +114,9 @@ class _Callback(_Unsaved, tune.Callback):
             return
         key, trace = trial.config["cell"], str(trial.get_error() or "its process died")
         path = self._location.cells / key / TRACE
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(trace + "\n")
+        with suppress(OSError):  # the disk may be full, which may be why the cell failed
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(trace + "\n")
         lines = [line for line in trace.splitlines() if line.strip()]
         self._listener.failed(key, f"{lines[-1]} (trace in {path})")
 
