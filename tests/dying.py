@@ -13,8 +13,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import sqlalchemy
 from mlflow.tracking.fluent import _active_run_stack
+from sqlalchemy import event
+from sqlalchemy.orm import Session
 
 CHANGES = {"os.rename", "os.remove"}
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
@@ -57,10 +58,10 @@ class Places:
             threading.excepthook = excepthook
             _active_run_stack.get().clear()  # the next process has none of this one's
 
-    def change(self, event: str, path: str) -> None:
+    def change(self, kind: str, path: str) -> None:
         """A change of a file."""
         if path.startswith(self._root) and not UNSEEN.search(path):
-            self._last_file = f"{event} {RANDOM.sub('*', path.removeprefix(self._root))}"
+            self._last_file = f"{kind} {RANDOM.sub('*', path.removeprefix(self._root))}"
             self._pass(self._last_file)
 
     def commit(self) -> None:
@@ -85,15 +86,15 @@ def _ignore_killed(args: threading.ExceptHookArgs) -> None:
 _present: Places | None = None
 
 
-def _audit(event: str, args: tuple) -> None:
-    if _present is not None and (event in CHANGES or (event == "open" and args[2] & WRITES)):
-        _present.change(event, os.fsdecode(args[0]) if isinstance(args[0], str | bytes | os.PathLike) else "")
+def _audit(name: str, args: tuple) -> None:
+    if _present is not None and (name in CHANGES or (name == "open" and args[2] & WRITES)):
+        _present.change(name, os.fsdecode(args[0]) if isinstance(args[0], str | bytes | os.PathLike) else "")
 
 
-def _commit(connection: object) -> None:
+def _commit(session: Session) -> None:
     if _present is not None:
         _present.commit()
 
 
 sys.addaudithook(_audit)
-sqlalchemy.event.listen(sqlalchemy.Engine, "commit", _commit)
+event.listen(Session, "before_commit", _commit)

@@ -92,6 +92,5 @@ def kill_until_done(places: Places, work: Callable[[], object]) -> None:
 def test_each_session_dies_at_a_later_place_of_the_end(trained, whole, capsys):
     rows, places = (trained / "r" / "metrics.jsonl").read_text(), Places(trained)
     kill_until_done(places, lambda: resume(trained))
-    print(len(places.deadly), *places.deadly, sep="\n")
     assert len(places.deadly) >= 30
     assert_whole(trained, whole, rows)
