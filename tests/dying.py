@@ -9,7 +9,7 @@ import re
 import sys
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -84,11 +84,28 @@ def _ignore_killed(args: threading.ExceptHookArgs) -> None:
 
 
 _present: Places | None = None
+_sees_writes: Callable[[str], None] | None = None
+
+
+@contextmanager
+def writes_seen(seen: Callable[[str], None]) -> Iterator[None]:
+    """Calls `seen` with the path of every file that is opened for writing in the `with` block; it may raise."""
+    global _sees_writes
+    _sees_writes = seen
+    try:
+        yield
+    finally:
+        _sees_writes = None
 
 
 def _audit(name: str, args: tuple) -> None:
-    if _present is not None and (name in CHANGES or (name == "open" and args[2] & WRITES)):
-        _present.change(name, os.fsdecode(args[0]) if isinstance(args[0], str | bytes | os.PathLike) else "")
+    is_write = name == "open" and args[2] & WRITES
+    if is_write or name in CHANGES:
+        path = os.fsdecode(args[0]) if isinstance(args[0], str | bytes | os.PathLike) else ""
+        if _present is not None:
+            _present.change(name, path)
+        if _sees_writes is not None and is_write:
+            _sees_writes(path)
 
 
 def _commit(session: Session) -> None:
