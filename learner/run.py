@@ -128,7 +128,7 @@ class RunSession:
                 with stop.at_once(), self._folder.traceback_kept(), self._guard():
                     result = self._train_and_end(checkpoint, more_steps, stop)
                 status = "FINISHED" if result.stopped_by is None else "KILLED"
-            except (KeyboardInterrupt, SystemExit):  # the latter from Ray's handler, or where a search ends a trial early
+            except (KeyboardInterrupt, SystemExit):  # the latter from Ray's handler, or a search that ends a trial
                 status = "KILLED"
                 raise
             finally:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 
 from rich.console import Console
@@ -17,7 +16,6 @@ from learner.sweep.cell import SweepLocation
 from learner.sweep.grid import Cell
 from learner.sweep.tune import run_cells
 from learner.tracking.mlflow_run import Tracker
-from learner.training.stop_signals import stop_on_signals
 
 
 class _Listener:
@@ -75,7 +73,7 @@ def _run_missing(command: Sweep, name: str, results: SweepResults, missing: list
     # Makes the store and the experiment here, before several processes open them.
     Tracker(location.tracking_uri, location.experiment, launch.artifact_root()).set_views()
     results.record_provenance()
-    with display, stop_on_signals(signal.SIGHUP) as stop, stop.at_once():  # a lost terminal is as Ctrl-C
+    with display:
         listener = _Listener(display, results)
         run_cells(command.grid, missing, location, launch.ray_address(), command.at_once, listener)
 

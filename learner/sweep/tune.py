@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import tempfile
 import time
 from collections.abc import Callable
@@ -25,6 +26,7 @@ from learner.ray_backend.metrics import RayMetrics
 from learner.sweep.cell import SweepLocation, run_cell
 from learner.sweep.grid import Cell, SweepConfig
 from learner.tracking.journal import Row
+from learner.training.stop_signals import stop_on_signals
 
 ATTEMPTS = 3
 """How often a cell is started at most before it counts as failed."""
@@ -171,7 +173,8 @@ def _fit(
                 verbose=0,
             ),
         )
-        with redirect_stdout(io.StringIO()):  # the listener shows what Tune would print
+        # The listener shows what Tune would print. The loss of the terminal ends a sweep as Ctrl-C does.
+        with redirect_stdout(io.StringIO()), stop_on_signals(signal.SIGHUP) as stop, stop.at_once():
             tuner.fit()
     leave()
 
