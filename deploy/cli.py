@@ -12,6 +12,7 @@ import functools
 import importlib
 import operator
 import os
+import signal
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -23,7 +24,9 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import tyro  # noqa: E402
 
-from actors.service.fault_policy import RunFailed  # noqa: E402
+from actors.service.fault_policy import RunFailed, first_line  # noqa: E402
+from actors.storage.full_disk import is_disk_full  # noqa: E402
+from deploy.console.streams import outlive_streams, prepare_streams  # noqa: E402
 from deploy.options.results import Dashboard, Evaluate, Export, Relocate, Report, Stress, Watch  # noqa: E402
 from deploy.options.training import Chaos, Resume, Search, Submit, Sweep, Train, ray_address  # noqa: E402
 from learner.config import RunConfig, from_dict  # noqa: E402
@@ -33,7 +36,8 @@ from sim_core.checks import ConfigError, require, require_packages  # noqa: E402
 
 FAILED = 1
 BAD_INPUT = 2
-INTERRUPTED = 130
+SIGNALLED = 128
+"""Exit code after a signal, plus its number."""
 Command = (
     Train
     | Sweep
@@ -67,6 +71,8 @@ COMMANDS: dict[type[Command], str] = {
 """Every command's name, by its options, in the order of the help text."""
 CONFIGS = Path(__file__).parent / "configs"
 """Configs that are part of shoal."""
+OUTLIVES_TERMINAL = (Train, Sweep, Search, Resume, Chaos)
+"""Commands whose work lies in a run's folder: they go on where nobody takes what they print."""
 JOBS = ("train", "sweep")
 """Commands that `shoal submit` can run."""
 BAD_PATH_ERRORS = (errno.ENAMETOOLONG, errno.EILSEQ, errno.ELOOP)
@@ -174,6 +180,8 @@ def _joins_cluster(command: Command) -> bool:
 
 def execute(command: Command) -> int:
     """Runs a command; returns its exit code."""
+    if isinstance(command, OUTLIVES_TERMINAL):
+        outlive_streams()
     guard_ray(_joins_cluster(command))  # sets what Ray reads when it is imported
     if isinstance(command, Dashboard):
         require_packages("shoal dashboard", "dashboard", "plotly")
@@ -183,6 +191,7 @@ def execute(command: Command) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of `shoal`; returns the exit code."""
+    prepare_streams()
     try:
         return execute(parse(sys.argv[1:] if arguments is None else arguments))
     except ConfigError as error:
@@ -191,19 +200,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
-    except OSError as error:
-        if error.errno in FORBIDDEN_ERRORS:
-            print(f"shoal: {error.filename} may not be used by you ({error.strerror}); ask its owner", file=sys.stderr)
-            return BAD_INPUT
-        if error.errno not in BAD_PATH_ERRORS:
-            raise
-        name = str(error.filename)
-        short = name if len(name) <= 60 else f"{name[:60]}..."
-        print(f"shoal: {short!r} cannot name a file ({error.strerror}); choose another name", file=sys.stderr)
-        return BAD_INPUT
     except RunFailed as error:
         print(f"shoal: {error}", file=sys.stderr)
         return FAILED
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         print("shoal: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return SIGNALLED + getattr(error, "signal", signal.SIGINT)
+    except Exception as error:
+        sentence, code = _explained(error)
+        if sentence is None:
+            raise
+        print(f"shoal: {sentence}", file=sys.stderr)
+        return code
+
+
+def _explained(error: Exception) -> tuple[str | None, int]:
+    """One sentence about an error of the disk or of a path, and the exit code; no sentence about any other error."""
+    if is_disk_full(error):
+        line = f"the disk is full ({first_line(error)}); free some space, then give the command again"
+        return f"{line}, or `shoal resume` for a run that has begun", FAILED
+    if isinstance(error, OSError) and error.errno in FORBIDDEN_ERRORS:
+        return f"{error.filename} may not be used by you ({error.strerror}); ask its owner", BAD_INPUT
+    if isinstance(error, OSError) and error.errno in BAD_PATH_ERRORS:
+        name = str(error.filename)
+        short = name if len(name) <= 60 else f"{name[:60]}..."
+        return f"{short!r} cannot name a file ({error.strerror}); choose another name", BAD_INPUT
+    return None, FAILED

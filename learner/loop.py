@@ -20,6 +20,7 @@ from actors.rollout.node import RolloutNode
 from actors.service.fault_policy import CallFailed, Component, ComponentFailed, ComponentKind, Diverged, FaultTracker
 from actors.service.messages import BlockReport, EpisodeStats
 from actors.service.rpc import Placed, by_reference
+from actors.storage.full_disk import DISK_TIMEOUT_S
 from actors.storage.uri import Location
 from learner.checkpoints.checkpoint import Checkpoint
 from learner.checkpoints.writer import CheckpointWriter
@@ -41,6 +42,8 @@ Ts = TypeVarTuple("Ts")
 
 EVAL_SEED = 1_000_000_000
 """First seed of the evaluations during training; training worlds draw theirs from other streams."""
+DISK_PAUSE_S = 5.0
+"""Time between two attempts to write the last checkpoint to a full disk."""
 LEARNER = Component(ComponentKind.LEARNER)
 EVALUATOR = Component(ComponentKind.EVALUATOR)
 
@@ -306,12 +309,16 @@ class TrainingLoop:
         return 1 if self._checkpoint_is_next() else limit
 
     def _save_the_end(self) -> None:
-        """Writes a checkpoint of the end, again if a component fails meanwhile."""
+        """Writes a checkpoint of the end, again if a component fails meanwhile, or once a full disk has space."""
         self._recover_if(self._checkpoints.wait())
         self._checkpoints.is_wanted = self.saved is None
+        deadline_s = time.monotonic() + DISK_TIMEOUT_S
         while self._checkpoints.is_wanted:
             self.begin_checkpoint()
             self._recover_if(self._checkpoints.wait())
+            if self._checkpoints.lacks_space and time.monotonic() < deadline_s:
+                time.sleep(DISK_PAUSE_S)
+                self._checkpoints.is_wanted = True
 
     def begin_checkpoint(self) -> None:
         """Begins a checkpoint of the whole run once nothing is in flight; no other may be being written."""

@@ -1,32 +1,37 @@
-"""One session of a run: restores a checkpoint or starts afresh, trains, evaluates, logs, and ends the MLflow run.
+"""One session of a run: restores a checkpoint or starts afresh, trains, makes the end, and ends the MLflow run.
 
 A session is one process's work on a run; `shoal resume` begins the next one. A session makes one attempt or several:
 each trains with one set of components. When a component is lost that only a checkpoint can bring back, the next attempt
-starts from the newest checkpoint.
+starts from the newest checkpoint. Once all env steps are done, a session only makes what is missing of the end
+(`learner.run_end`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, closing, nullcontext
-from functools import cached_property
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from functools import cached_property, partial
+from typing import NamedTuple, TypeVar
 
 from actors.evaluation.evaluator import evaluate_in_parallel
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.env_guard import env_guard
-from actors.rollout.worker import join_stats, select_stats
+from actors.rollout.vector_env import EnvSpec
+from actors.rollout.worker import select_stats
 from actors.service.fault_policy import STEADY_CALLS, CallFailed, ComponentFailed, FaultTracker, RunFailed, first_line
 from actors.service.messages import EpisodeStats
-from actors.storage.uri import Location
+from actors.service.rpc import Calls, LocalCalls
+from actors.storage.full_disk import DISK_TIMEOUT_S, is_disk_full, is_full
+from actors.storage.uri import Location, join_location
 from learner.checkpoints.checkpoint import Checkpoint, check_config, check_state, newest_valid
 from learner.checkpoints.manifest import CheckpointError, UnusableCheckpointError
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig
 from learner.file_names import CONFIG
 from learner.loop import TrainingLoop
-from learner.ray_backend.cluster import RayCluster
+from learner.ray_backend.cluster import RayCluster, task_calls
 from learner.ray_backend.metrics import RayMetrics
+from learner.run_end import EndState, RunEnd, discard_end, final_seeds
 from learner.run_folder import RunFolder
 from learner.tracking.delivery import Delivery, retry
 from learner.tracking.fault_log import FaultLog
@@ -37,7 +42,9 @@ from learner.tracking.redaction import hide_secrets
 from learner.training.cluster import Cluster, ProcessCluster
 from learner.training.evaluation_summary import Evaluation, as_metrics, score, summarise
 from learner.training.recovery import RunLost
-from learner.training.stop_signals import stop_on_signals
+from learner.training.stop_signals import STOPPING, StopRequest, stop_on_signals
+
+T = TypeVar("T")
 
 LAST_FLUSH_S = 5.0
 """How long a stopped run waits for MLflow; the next session delivers the rest."""
@@ -49,10 +56,10 @@ MISMATCH_ERRORS = (ValueError, TypeError, KeyError, IndexError, AttributeError, 
 class RunResult(NamedTuple):
     """How a session ended.
 
-    `checkpoint` is the location of the session's last checkpoint, None if it could not be written. `stopped_by` is the
+    `checkpoint` is the location of the run's last checkpoint, None if it could not be written. `stopped_by` is the
     number of the signal that stopped the run before its end, else None. `evaluation` summarises the final greedy
     `episodes`, played with `weights`; all three are None if the run was stopped. `by_setup` summarises them by setup
-    where there are several.
+    where there are several. `is_known` tells whether MLflow knows how the session ended.
     """
 
     env_steps: int
@@ -63,6 +70,18 @@ class RunResult(NamedTuple):
     episodes: EpisodeStats | None
     weights: WeightsSnapshot | None
     by_setup: dict[str, Evaluation]
+    is_known: bool = True
+
+
+class Step(NamedTuple):
+    """A step of a run's end beside those of every run: its name, unique in the run, and a call that may be repeated."""
+
+    name: str
+    make: Callable[[], None]
+
+
+MoreSteps = Callable[[RunResult, list[Row]], list[Step]]
+"""The further steps of a finished run, from its result and all rows of metrics."""
 
 
 class RunSession:
@@ -84,103 +103,204 @@ class RunSession:
         self._tracker = tracker
         self._display = display
         self._options = options
-        self._fault_log = FaultLog(folder.faults)
+        self._fault_log = FaultLog(folder.faults, display.message)
         self._fault_tracker = FaultTracker(1 if config.env.is_swarm else STEADY_CALLS)
 
-    def execute(self, checkpoint: Checkpoint | None, finish: Callable[[RunResult, list[Row]], None]) -> RunResult:
-        """Trains to the end, evaluates, logs the result and ends the MLflow run.
+    def execute(self, checkpoint: Checkpoint | None, more_steps: MoreSteps) -> RunResult:
+        """Trains to the end unless an earlier session did, makes what is missing of the end, and ends the MLflow run.
 
         Args:
-          checkpoint: where to resume, None for a fresh start.
-          finish: makes and logs the artifacts of a finished run from its result and all rows of metrics; called again
-            where MLflow fails.
+          checkpoint: where to resume the training, None for a fresh start.
+          more_steps: the further steps of the end, such as making and logging the artifacts.
 
         Returns:
           How the session ended. The MLflow run is FINISHED, or KILLED if a signal stopped it; then it can be resumed.
 
         Raises:
-          RunFailed: a component fails again and again, or the training diverges; the MLflow run is FAILED.
+          RunFailed: a component or a step of the end fails again and again, or the training diverges; the MLflow run is
+            FAILED.
           ConfigError: a user's own code does what it must not; the MLflow run is FAILED.
+          Interrupted: a signal arrived while the session started or made the end; the MLflow run is KILLED.
         """
-        status = "FAILED"
-        try:
-            with self._folder.traceback_kept(), self._guard():
-                result, rows = self._train_and_evaluate(checkpoint)
-                if result.evaluation is not None:
-                    self._log(result, result.evaluation, rows, finish)
-            status = "FINISHED" if result.stopped_by is None else "KILLED"
-            return result
-        except (KeyboardInterrupt, SystemExit):  # the latter where a search ends a trial early
-            status = "KILLED"
-            raise
-        finally:
-            self._end(status)
+        status, is_known = "FAILED", False
+        with closing(self._fault_log), stop_on_signals(*STOPPING) as stop:
+            try:
+                with stop.at_once(), self._folder.traceback_kept(), self._guard():
+                    result = self._train_and_end(checkpoint, more_steps, stop)
+                status = "FINISHED" if result.stopped_by is None else "KILLED"
+            except (KeyboardInterrupt, SystemExit):  # the latter from Ray's handler, or a search that ends a trial
+                status = "KILLED"
+                raise
+            finally:
+                is_known = self._end(status)
+            return result._replace(is_known=is_known)
 
     def _guard(self) -> AbstractContextManager[None]:
         """Keeps a foreign environment from hanging this process or leaving it; those of Ray's actors have deadlines."""
         return nullcontext() if self._config.env.is_swarm else env_guard(self._options.deadline_s)
 
-    def _train_and_evaluate(self, checkpoint: Checkpoint | None) -> tuple[RunResult, list[Row]]:
-        """Makes attempts until one succeeds; returns its result and all rows of metrics."""
+    def _train_and_end(self, checkpoint: Checkpoint | None, more_steps: MoreSteps, stop: StopRequest) -> RunResult:
+        """What is missing of the training, unless a signal stops it, and of the end."""
+        outcome = RunEnd.open(self._folder.end, self._config) or self._train(checkpoint, stop)
+        return outcome if isinstance(outcome, RunResult) else self._make_end(outcome, more_steps, stop)
+
+    def _train(self, checkpoint: Checkpoint | None, stop: StopRequest) -> RunResult | RunEnd:
+        """Makes attempts until one succeeds; returns how a signal stopped it, or else the end that it began."""
+        discard_end(self._folder.end)
         incarnation = checkpoint.state["incarnation"] + 1 if checkpoint else 0
         resumed = checkpoint is not None
         while True:
             try:
-                return self._attempt(checkpoint, incarnation, resumed)
+                return self._attempt(checkpoint, incarnation, resumed, stop)
             except RunLost as lost:
                 incarnation = lost.incarnation + 1
             resumed = False
             checkpoint = last_checkpoint(self._folder, self._config)
             self._display.message(f"going on from {checkpoint.folder if checkpoint else 'the start'}")
 
-    def _attempt(self, checkpoint: Checkpoint | None, incarnation: int, resumed: bool) -> tuple[RunResult, list[Row]]:
+    def _attempt(
+        self, checkpoint: Checkpoint | None, incarnation: int, resumed: bool, stop: StopRequest
+    ) -> RunResult | RunEnd:
         """Trains and evaluates with one set of components, whose first incarnation is `incarnation`.
 
         Raises:
           RunLost: a component is lost that only a checkpoint can bring back.
         """
         offset = checkpoint.state["journal_offset"] if checkpoint else 0
-        with closing(Journal(self._folder.journal, offset)) as journal:
+        with closing(self._journal(offset)) as journal:
             cluster = open_cluster(self._config, incarnation, self._options)
-            with closing(
-                Delivery(self._tracker, journal, PushedMark(self._folder.pushed, offset), self._say)
-            ) as delivery:
+            stop.listen(STOPPING)  # Ray has set a handler of its own
+            with closing(self._delivery(journal, offset)) as delivery:
                 delivery.deliver_up_to(offset)
                 observer = MirroringObserver(delivery, self._fault_log, self._display, self._monitor, resumed)
-                result = self._run_loop(checkpoint, journal, cluster, observer)
+                outcome = self._run_loop(checkpoint, journal, cluster, observer, stop)
                 cluster.close()  # not after an error: references in its traceback must not outlive Ray
-                if result.evaluation is not None:
-                    delivery.deliver_up_to(journal.length)  # even if the last checkpoint could not be written
-                self._flush(delivery, result)
-                return result, journal.rows()
+                if isinstance(outcome, RunResult):
+                    self._say_undelivered(delivery.flush(LAST_FLUSH_S))
+                return outcome
+
+    def _journal(self, offset: int) -> Journal:
+        return Journal(self._folder.journal, offset, self._display.message)
+
+    def _delivery(self, journal: Journal, offset: int) -> Delivery:
+        return Delivery(self._tracker, journal, PushedMark(self._folder.pushed, offset), self._say)
 
     def _run_loop(
-        self, checkpoint: Checkpoint | None, journal: Journal, cluster: Cluster, observer: MirroringObserver
-    ) -> RunResult:
-        """Restores, trains, and evaluates the final policy.
+        self,
+        checkpoint: Checkpoint | None,
+        journal: Journal,
+        cluster: Cluster,
+        observer: MirroringObserver,
+        stop: StopRequest,
+    ) -> RunResult | RunEnd:
+        """Restores, trains, and evaluates the final policy; returns how a signal stopped it, or the end that it began.
 
         Raises:
           RunLost: see `_attempt`.
         """
         checkpoints, keep_best = self._folder.checkpoint_location(), self._folder.storage().keep_best
-        with stop_on_signals() as stop:
-            loop = TrainingLoop(
-                self._config, cluster, journal, checkpoints, observer, stop, self._fault_tracker, keep_best
-            )
-            try:
-                if checkpoint is not None:
-                    _restore(loop, checkpoint)
-                observer.ready()
-                if not loop.run():
-                    return RunResult(loop.env_steps, loop.updates, loop.saved, stop.signal, None, None, None, {})
-                self._display.message(f"training done; evaluating {self._config.final_eval_episodes} greedy episodes")
-                weights = loop.newest_weights()
-                episodes = final_evaluation(self._config, cluster, weights)
-            except ComponentFailed as failure:  # before or after the rounds of training
-                raise loop.lost(failure) from failure
-            by_setup = evaluation_by_setup(self._config, episodes)
-            evaluation = summarise(episodes)
-            return RunResult(loop.env_steps, loop.updates, loop.saved, None, evaluation, episodes, weights, by_setup)
+        loop = TrainingLoop(self._config, cluster, journal, checkpoints, observer, stop, self._fault_tracker, keep_best)
+        try:
+            if checkpoint is not None:
+                _restore(loop, checkpoint)
+            observer.ready()
+            with stop.at_once(False):  # the loop asks for the request, and saves before it stops
+                is_done = loop.run()
+            if not is_done:
+                return RunResult(loop.env_steps, loop.updates, loop.saved, stop.signal, None, None, None, {})
+            end = self._begin_end(loop, journal)
+            stop.check()
+            self._evaluate(end, cluster.calls, cluster.limits.eval_tasks)
+            return end
+        except ComponentFailed as failure:  # before or after the rounds of training
+            raise loop.lost(failure) from failure
+
+    def _begin_end(self, loop: TrainingLoop, journal: Journal) -> RunEnd:
+        """Makes durable that all env steps are done, and what the end works from."""
+        saved = None if loop.saved is None else str(loop.saved).rsplit("/", 1)[1]
+        state = EndState(loop.env_steps, loop.updates, self._patiently(journal.sync, "the metrics"), saved, [])
+        weights = loop.newest_weights()
+        begin = partial(RunEnd.begin, self._folder.end, self._config, state, weights)
+        return self._patiently(begin, "the policy")
+
+    def _evaluate(self, end: RunEnd, calls: Calls, max_calls: int) -> None:
+        """Plays the final episodes that are missing, in parallel tasks that need no component of the run.
+
+        Raises:
+          RunFailed: a task fails again and again.
+        """
+
+        def play(spec: EnvSpec, weights: WeightsSnapshot) -> EpisodeStats:
+            return evaluate_in_parallel(calls, spec, calls.put(weights), final_seeds(self._config), max_calls)
+
+        episodes = f"{self._config.final_eval_episodes} greedy episodes"
+        self._display.message(f"training done; evaluating {episodes}")
+        try:
+            self._patiently(partial(end.evaluate, play), "the final episodes")
+        except CallFailed as failure:
+            whose = "" if self._config.env.is_swarm else f" of env_id {self._config.env_id!r}"
+            raise RunFailed(
+                f"the evaluation{whose} at the end {failure.fault} again and again: {failure.reason}"
+            ) from failure
+
+    def _make_end(self, end: RunEnd, more_steps: MoreSteps, stop: StopRequest) -> RunResult:
+        """Makes the steps of the end that are missing; returns the run's result.
+
+        Raises:
+          RunFailed: a step cannot be made now.
+        """
+        if end.episodes() is None:
+            with open_calls(self._config, self._options) as (calls, max_calls):
+                stop.listen(STOPPING)
+                self._evaluate(end, calls, max_calls)
+        result, rows = self._result(end), self._deliver_all(end)
+        steps = [Step("the results", partial(self._log_results, result, rows)), *more_steps(result, rows)]
+        for name, make in steps:
+            end.make(name, partial(self._patiently, make, name))
+        return result
+
+    def _result(self, end: RunEnd) -> RunResult:
+        episodes = end.episodes()
+        assert episodes is not None
+        env_steps, updates, _, name, _ = end.state
+        checkpoint = name and join_location(self._folder.checkpoint_location(), name)
+        by_setup = evaluation_by_setup(self._config, episodes)
+        return RunResult(env_steps, updates, checkpoint, None, summarise(episodes), episodes, end.weights, by_setup)
+
+    def _deliver_all(self, end: RunEnd) -> list[Row]:
+        """Waits until MLflow has all rows of metrics; returns them.
+
+        Raises:
+          RunFailed: it does not take them in time.
+        """
+        length = end.state.journal_bytes
+        with closing(self._journal(length)) as journal, closing(self._delivery(journal, length)) as delivery:
+            delivery.deliver_up_to(length)
+            reason = delivery.flush(max(LAST_FLUSH_S, self._tracker.retry_timeout_s))
+            if reason is not None and is_full(reason):
+                reason = delivery.flush(DISK_TIMEOUT_S)
+            if reason is not None:
+                raise self._lacking("the newest metrics", reason)
+            return journal.rows()
+
+    def _lacking(self, what: str, reason: str) -> RunFailed:
+        told = hide_secrets(reason, self._tracker.uri)
+        return RunFailed(
+            f"the run is trained, but its end lacks {what} ({told}); `shoal resume {self._folder.path}` makes it"
+        )
+
+    def _patiently(self, make: Callable[[], T], what: str) -> T:
+        """Makes a step once MLflow and the disk take it.
+
+        Raises:
+          RunFailed: they did not in time.
+        """
+        try:
+            return retry(make, what, self._tracker.retry_timeout_s, self._say)
+        except Exception as error:
+            if not (isinstance(error, MLFLOW_ERRORS) or is_disk_full(error)):
+                raise
+            raise self._lacking(what, first_line(error)) from error
 
     @cached_property
     def _monitor(self) -> Callable[[Row], None]:
@@ -191,39 +311,31 @@ class RunSession:
         """Shows a line about MLflow, whose errors contain its address, without the address's password."""
         self._display.message(hide_secrets(text, self._tracker.uri))
 
-    def _flush(self, delivery: Delivery, result: RunResult) -> None:
-        is_stopped = result.stopped_by is not None
-        reason = delivery.flush(LAST_FLUSH_S if is_stopped else max(LAST_FLUSH_S, self._tracker.retry_timeout_s))
+    def _say_undelivered(self, reason: str | None) -> None:
         if reason is not None:
             self._say(f"MLflow lacks the newest metrics, which `shoal resume` sends again: {reason}")
 
-    def _log(
-        self,
-        result: RunResult,
-        evaluation: Evaluation,
-        rows: list[Row],
-        finish: Callable[[RunResult, list[Row]], None],
-    ) -> None:
-        """Logs the results and the artifacts of a finished run, and retries while MLflow fails."""
-        tracker, timeout_s = self._tracker, self._tracker.retry_timeout_s
-        metrics, time_ms = as_metrics(evaluation), self._time_of_results(result, rows)
+    def _log_results(self, result: RunResult, rows: list[Row]) -> None:
+        assert result.evaluation is not None
+        metrics = as_metrics(result.evaluation)
         if result.by_setup:
             metrics["worst_setup"] = min(map(score, result.by_setup.values()))
-        retry(lambda: tracker.log_results(metrics, time_ms), "the results", timeout_s, self._say)
-        retry(lambda: finish(result, rows), "the artifacts", timeout_s, self._say)
+        self._tracker.log_results(metrics, self._time_of_results(result, rows))
 
     def _time_of_results(self, result: RunResult, rows: list[Row]) -> int:
         """A time in ms that is the same however often a result is logged, and differs once the run is trained on."""
         last = rows[-1] if rows else Row(0, self._tracker.started_ms, {})
         return last.time_ms + result.env_steps - last.env_steps
 
-    def _end(self, status: str) -> None:
-        """Ends the MLflow run; where MLflow fails, the next session ends it."""
+    def _end(self, status: str) -> bool:
+        """Ends the MLflow run; returns whether MLflow took it. Where it did not, the next session ends the run."""
         timeout_s = self._tracker.retry_timeout_s if status == "FINISHED" else 0.0
         try:
             retry(lambda: self._tracker.end(status), f"that the run is {status}", timeout_s, self._say)
+            return True
         except MLFLOW_ERRORS as error:
             self._say(f"MLflow does not know that the run is {status}: {first_line(error)}")
+            return False
 
 
 def evaluation_by_setup(config: RunConfig, episodes: EpisodeStats) -> dict[str, Evaluation]:
@@ -240,6 +352,16 @@ def open_cluster(config: RunConfig, incarnation: int, options: ClusterOptions) -
     if config.engine == "process":
         return ProcessCluster(config, incarnation)
     return RayCluster(config, incarnation, options)
+
+
+@contextmanager
+def open_calls(config: RunConfig, options: ClusterOptions) -> Iterator[tuple[Calls, int]]:
+    """Calls for tasks alone, without the run's components, under its engine; and how many to make at once."""
+    if config.engine == "process":
+        yield LocalCalls(), 1
+    else:
+        with task_calls(options.address) as calls:
+            yield calls
 
 
 def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list[str]]:
@@ -273,27 +395,3 @@ def _restore(loop: TrainingLoop, checkpoint: Checkpoint) -> None:
     except MISMATCH_ERRORS as error:
         cause = getattr(error, "cause", error)  # Ray wraps what an actor raises
         raise CheckpointError(f"checkpoint {checkpoint.folder} does not fit this run: {cause}") from error
-
-
-def final_evaluation(config: RunConfig, cluster: Cluster, weights: WeightsSnapshot) -> EpisodeStats:
-    """Plays `final_eval_episodes` greedy episodes with `weights`, in parallel tasks that need no component of the run.
-
-    Returns:
-      One entry per episode; of several setups, that many of each, one setup after the other.
-
-    Raises:
-      RunFailed: a task fails again and again.
-    """
-    first = config.final_eval_first_seed
-    seeds = list(range(first, first + config.final_eval_episodes))
-    shared = cluster.calls.put(weights)
-    specs = [config.env.of_setup(world) for world in config.env.worlds]
-    try:
-        return join_stats(
-            [evaluate_in_parallel(cluster.calls, spec, shared, seeds, cluster.limits.eval_tasks) for spec in specs]
-        )
-    except CallFailed as failure:
-        whose = "" if config.env.is_swarm else f" of env_id {config.env_id!r}"
-        raise RunFailed(
-            f"the evaluation{whose} at the end {failure.fault} again and again: {failure.reason}"
-        ) from failure

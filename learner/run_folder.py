@@ -52,6 +52,7 @@ class RunFolder:
         self.pushed = self.path / file_names.PUSHED
         self.faults = self.path / file_names.FAULTS
         self.artifacts = self.path / file_names.ARTIFACTS
+        self.end = self.path / file_names.END
         self.policy = self.path / file_names.POLICY
         self.results = self.path / file_names.RESULTS
         self._identity = self.path / file_names.IDENTITY

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -84,6 +86,39 @@ def load_evaluation(path: Path) -> StoredEvaluation:
         raise ValueError(f"{path} has settings of another version of shoal ({error}); evaluate again") from error
     stats = EpisodeStats(*(rows[name] for name in EpisodeStats._fields))
     return StoredEvaluation(spec, header["player"], header["updates"], rows["seed"], stats)
+
+
+def find_evaluation(path: Path, spec: EnvSpec, updates: int, seeds: list[int]) -> EpisodeStats | None:
+    """The episodes at `path`; None where there are none, or they are damaged, or of another evaluation.
+
+    Args:
+      path: a zarr group that belongs to one policy.
+      spec: the environment.
+      updates: number of updates applied to the policy's weights.
+      seeds: one episode was played per seed.
+
+    Returns:
+      One entry per seed, in order.
+    """
+    try:
+        stored = load_evaluation(path)
+    except (ValueError, OSError):
+        return None
+    is_wanted = (stored.spec, stored.updates, stored.seed.tolist()) == (spec, updates, seeds)
+    return stored.stats if is_wanted else None
+
+
+def stored_or_played(
+    path: Path, spec: EnvSpec, candidate: str, updates: int, seeds: list[int], play: Callable[[], EpisodeStats]
+) -> EpisodeStats:
+    """The episodes of `find_evaluation`, or else those that `play` plays; they are stored as those of `candidate`."""
+    found = find_evaluation(path, spec, updates, seeds)
+    if found is not None:
+        return found
+    stats = play()
+    shutil.rmtree(path, ignore_errors=True)
+    save_evaluation(path, StoredEvaluation(spec, candidate, updates, np.array(seeds, np.int64), stats))
+    return stats
 
 
 def _crc32(header: dict[str, Any]) -> int:

@@ -1,13 +1,11 @@
-"""`shoal resume`: resumes a run from its newest usable checkpoint."""
+"""`shoal resume`: resumes a run at its end, from its newest usable checkpoint, or from its start."""
 
 from __future__ import annotations
 
 import dataclasses
 
 from deploy.options.training import Resume
-from deploy.training import open_tracker, print_resume_point, resume_training
-from learner.config import RunConfig
-from learner.run import resume_point
+from deploy.training import finished_at, open_tracker, resume_training
 from learner.run_folder import find_run
 from sim_core.checks import require
 
@@ -21,21 +19,12 @@ def run(command: Resume) -> int:
     folder = find_run(command.run, command.runs_dir)
     with folder.lock():
         config = folder.config()
-        checkpoint, skipped = resume_point(folder, config)
-        config = _extended(config, command.total_env_steps, checkpoint.state["env_steps"])
-        config = dataclasses.replace(config, device=command.device or config.device)
+        total = config.total_env_steps if command.total_env_steps is None else command.total_env_steps
+        config = dataclasses.replace(config, total_env_steps=total, device=command.device or config.device)
         tracker = open_tracker(folder)
-        print_resume_point(checkpoint, skipped)
-        return resume_training(folder, config, tracker, checkpoint, command.cluster_options())
-
-
-def _extended(config: RunConfig, total_env_steps: int | None, done: int) -> RunConfig:
-    """The config with the new target; raises ConfigError if `done` env steps have reached it."""
-    if total_env_steps is not None:
-        config = dataclasses.replace(config, total_env_steps=total_env_steps)
-    require(
-        done < config.total_env_steps,
-        f"the run has finished its {config.total_env_steps} env steps; "
-        f"train on with --total-env-steps greater than {done}",
-    )
-    return config
+        done = finished_at(folder, config, tracker)
+        require(
+            done is None,
+            f"the run has finished its {total} env steps; train on with --total-env-steps greater than {done}",
+        )
+        return resume_training(folder, config, tracker, command.cluster_options())

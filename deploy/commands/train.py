@@ -18,15 +18,13 @@ from deploy.runs.folders import (
 from deploy.training import (
     check_device,
     check_environment,
+    finished_at,
     open_tracker,
-    print_resume_point,
     resume_training,
     run_training,
 )
-from learner.checkpoints.checkpoint import finished_names
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig, config_hash
-from learner.run import resume_point
 from learner.run_folder import RunFolder, RunIdentity
 from learner.tracking.mlflow_run import Tracker
 from learner.tracking.redaction import public_uri
@@ -96,18 +94,13 @@ def _check_storage(folder: RunFolder, checkpoint_url: str | None) -> None:
 
 
 def _resume(folder: RunFolder, config: RunConfig, options: ClusterOptions) -> int:
-    """Resumes an unfinished run from its newest checkpoint, or from its start; returns the exit code."""
-    known = folder.config()
+    """Resumes an unfinished run; returns the exit code."""
     require(
-        config_hash(known) == config_hash(config),
+        config_hash(folder.config()) == config_hash(config),
         f"{folder.path} holds a run of other settings; choose another --name",
     )
     tracker = open_tracker(folder)
-    if config.total_env_steps <= known.total_env_steps and tracker.is_finished(folder.identity().mlflow_run_id):
+    if finished_at(folder, config, tracker) is not None:
         plain_console().print(f"run {folder.path} has finished before", soft_wrap=True)
         return 0
-    checkpoint = None
-    if finished_names(folder.checkpoint_location()):
-        checkpoint, skipped = resume_point(folder, config)
-        print_resume_point(checkpoint, skipped)
-    return resume_training(folder, config, tracker, checkpoint, options)
+    return resume_training(folder, config, tracker, options)

@@ -19,7 +19,7 @@ from deploy.runs.folders import write_text
 from deploy.runs.learning_curve import curve_points
 from learner.config import RunConfig
 from learner.file_names import CONFIG
-from learner.run import RunResult
+from learner.run import RunResult, Step
 from learner.run_folder import RunFolder
 from learner.tracking.journal import Row
 from learner.tracking.mlflow_run import Tracker
@@ -32,33 +32,51 @@ EPISODES_TRIED = 10
 VIDEO_SIZE_PX = 480
 
 
-def log_artifacts(
+def artifact_steps(
     folder: RunFolder,
     config: RunConfig,
     tracker: Tracker,
+    message: Callable[[str], None],
     result: RunResult,
     rows: list[Row],
+) -> list[Step]:
+    """The steps of a run's end that write its artifacts and upload them; `message` tells if one is left out."""
+    weights, evaluation = result.weights, result.evaluation
+    assert weights is not None and evaluation is not None
+
+    def log_files() -> None:
+        message("logging curve, animation and policy")
+        for path in _write_files(folder, config, result, weights, rows, message):
+            tracker.log_artifact(path)
+
+    def log_policy() -> None:
+        tracker.log_policy(weights, config, env_shape(config.env), score(evaluation))
+
+    return [Step("the artifacts", log_files), Step("the policy", log_policy)]
+
+
+def _write_files(
+    folder: RunFolder,
+    config: RunConfig,
+    result: RunResult,
+    weights: WeightsSnapshot,
+    rows: list[Row],
     message: Callable[[str], None],
-) -> None:
-    """Writes all artifacts of a finished run and uploads them to MLflow; reports by `message` if one is left out."""
-    assert result.weights is not None and result.evaluation is not None
+) -> list[Path]:
+    """Writes the curve, the animation and the rates of every setup; returns all files to upload."""
     folder.artifacts.mkdir(exist_ok=True)
     written = [folder.path / CONFIG, _curve(folder, config, [*rows, _last_row(result)])]
     if config.env.is_swarm:
-        written += _swarm_animation(folder, config, result.weights)
+        written += _swarm_animation(folder, config, weights)
     else:
         path = folder.artifacts / "episode.mp4"
         try:
             check_video_packages()
-            foreign_animation(config, result.weights, config.final_eval_first_seed, path)
+            foreign_animation(config, weights, config.final_eval_first_seed, path)
             written.append(path)
         except ConfigError as error:
             message(f"no animation: {error}")
-    if result.by_setup:
-        written.append(_setups(folder, result))
-    for path in written:
-        tracker.log_artifact(path)
-    tracker.log_policy(result.weights, config, env_shape(config.env), score(result.evaluation))
+    return written + ([_setups(folder, result)] if result.by_setup else [])
 
 
 def _setups(folder: RunFolder, result: RunResult) -> Path:

@@ -44,7 +44,7 @@ def save_policy(path: Path, weights: WeightsSnapshot, config: RunConfig, shape: 
     network = acting_network(config, shape)
     load_snapshot(network, weights)
     tensors = {f"{ONLINE}{name}": tensor for name, tensor in network.state_dict().items()}
-    with replacing_file(path) as partial:
+    with replacing_file(path, sync_first=True) as partial:
         partial.write_bytes(to_bytes(tensors, metadata={"updates": str(weights.version)}))
 
 

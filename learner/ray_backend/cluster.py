@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar, TypeVarTuple
 
@@ -140,7 +141,8 @@ def connect(cpus: int, address: str | None, spare_cpus: int = 0) -> None:
             options["_temp_dir"] = str(own)
             _own_folders.append(own)
     try:
-        ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
+        with _kept_from_children(signal.SIGHUP):
+            ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
     except (ConnectionError, AuthenticationError) as error:
         raise ConfigError(
             f"no Ray cluster answers at {address!r}; start one with `ray start --head`, "
@@ -153,6 +155,20 @@ def connect(cpus: int, address: str | None, spare_cpus: int = 0) -> None:
             f"the run needs {cpus} CPUs (one each for a rollout worker, a shard actor and the learner), "
             f"the cluster has {have}: lower workers or replay_shards, or add nodes"
         )
+
+
+@contextmanager
+def _kept_from_children(number: int) -> Iterator[None]:
+    """Blocks a signal in all processes that start in the `with` block; here it arrives afterwards.
+
+    A terminal that closes hangs up on all of its processes at once. The driver then needs the others for a checkpoint.
+    Ray itself does the same with Ctrl-C.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def leave() -> None:
@@ -195,14 +211,25 @@ def evaluate_each(
     Raises:
       RunFailed: a task fails again and again.
     """
-    connect(1, address)
-    calls, sent = RayCalls(DEADLINE_S), dict[int, Ref[Candidate]]()
-    try:
-        cpus = cluster_cpus()
+    sent = dict[int, Ref[Candidate]]()
+    with task_calls(address) as (calls, cpus):
         for spec, candidate in work:
             if id(candidate) not in sent:
                 sent[id(candidate)] = calls.put(candidate)
             yield evaluate_in_parallel(calls, spec, sent[id(candidate)], seeds, cpus)
+
+
+@contextmanager
+def task_calls(address: str | None) -> Iterator[tuple[RayCalls, int]]:
+    """Joins a cluster for tasks alone; gives their calls, and how many CPUs there are.
+
+    Raises:
+      ConfigError: see `connect`.
+      RunFailed: a task fails again and again.
+    """
+    connect(1, address)
+    try:
+        yield RayCalls(DEADLINE_S), cluster_cpus()
     except CallFailed as failure:
         raise RunFailed(f"the evaluation {failure.fault} again and again: {failure.reason}") from failure
     finally:

@@ -9,24 +9,27 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from actors.evaluation.evaluation_store import StoredEvaluation, save_evaluation
+from actors.evaluation.evaluation_store import stored_or_played
 from actors.evaluation.evaluator import evaluate
 from actors.evaluation.result_table import LEARNED, ResultRow, read_table, write_table
 from actors.policy.baselines import Baseline
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import env_shape
+from actors.service.fault_policy import RunFailed
 from actors.service.messages import EpisodeStats
 from learner.checkpoints.checkpoint import Checkpoint
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig
 from learner.export.policy_file import read_saved_policy, save_policy
 from learner.file_names import EVALUATIONS
-from learner.run import RunResult, RunSession, last_checkpoint
+from learner.run import RunResult, RunSession, Step, last_checkpoint
+from learner.run_end import RunEnd, discard_end, final_seeds
 from learner.run_folder import RunFolder, RunIdentity
 from learner.sweep.grid import Cell, SweepConfig, cell_hash, done_cells, extrapolation_worlds, wanted_episodes
 from learner.tracking.journal import Row
@@ -129,21 +132,39 @@ def run_cell(sweep: SweepConfig, cell: Cell, location: SweepLocation, on_row: Ca
       Path of the cell's table of results.
     """
     folder = RunFolder(location.cells / cell.key)
-    if folder.results.is_file() and done_cells(sweep, [cell], read_table(folder.results)):
-        return folder.results
-    checkpoint = last_checkpoint(folder, cell.config)
+    if folder.results.is_file():
+        _remove_training(folder)  # a kill may have prevented it
+        if done_cells(sweep, [cell], read_table(folder.results)):
+            return folder.results
+    end = RunEnd.open(folder.end, cell.config) if cell.policy == LEARNED else None
+    checkpoint = last_checkpoint(folder, cell.config) if end is None else None
     tracker = _start_or_resume(cell, sweep, folder, location)
     if cell.policy != LEARNED:
         with tracker.ending():
             _play_baseline(sweep, cell, folder, tracker)
-    elif folder.policy.is_file() and not folder.checkpoints.exists():
+    elif end is None and folder.policy.is_file() and not folder.checkpoints.exists():
         with tracker.ending():
             _evaluate_again(sweep, cell, folder, tracker)
     else:
+        if end is None:
+            _prepare_training(folder, tracker, checkpoint)
         _train(sweep, cell, folder, location, tracker, checkpoint, on_row)  # ends the MLflow run itself
     _new_table(folder).rename(folder.results)  # once MLflow has everything and the run is ended
-    shutil.rmtree(folder.checkpoints, ignore_errors=True)  # the policy and the results stay
+    _remove_training(folder)
     return folder.results
+
+
+def _remove_training(folder: RunFolder) -> None:
+    """Removes what only a resumed training needs; the policy and the results of a cell that is done stay."""
+    shutil.rmtree(folder.checkpoints, ignore_errors=True)
+    discard_end(folder.end)
+
+
+def _prepare_training(folder: RunFolder, tracker: Tracker, checkpoint: Checkpoint | None) -> None:
+    """Removes evaluations of an older policy; logs no metric twice if a session that left no checkpoint logged some."""
+    shutil.rmtree(folder.path / EVALUATIONS, ignore_errors=True)
+    if checkpoint is None:
+        tracker.skip_logged_metrics()  # the same values, measured at another time
 
 
 def _train(
@@ -155,40 +176,52 @@ def _train(
     checkpoint: Checkpoint | None,
     on_row: Callable[[Row], None],
 ) -> None:
-    """Trains from the checkpoint or afresh, and evaluates the policy."""
-    if checkpoint is None:
-        tracker.skip_logged_metrics()  # of a session that left no checkpoint: the same values, measured at another time
+    """Trains from the checkpoint or afresh, and evaluates the policy; goes on where an earlier session got to.
 
-    def finish(result: RunResult, rows: list[Row]) -> None:
-        assert result.weights is not None and result.episodes is not None and result.evaluation is not None
+    Raises:
+      RunFailed: MLflow or the disk does not take the results, or that they are all.
+    """
+
+    def steps(result: RunResult, rows: list[Row]) -> list[Step]:
+        weights, episodes, evaluation = result.weights, result.episodes, result.evaluation
+        assert weights is not None and episodes is not None and evaluation is not None
         shape = env_shape(cell.config.env)
-        save_policy(folder.policy, result.weights, cell.config, shape)
-        results = _evaluate_all(sweep, cell, folder, result.weights, result.episodes)
-        tracker.log_artifact(folder.policy)
-        if location.registers:
-            tracker.log_policy(result.weights, cell.config, shape, score(result.evaluation))
-        _log_table(results, folder, tracker)
 
-    RunSession(folder, cell.config, tracker, RowDisplay(on_row), ClusterOptions()).execute(checkpoint, finish)
+        def log_file() -> None:
+            save_policy(folder.policy, weights, cell.config, shape)
+            tracker.log_artifact(folder.policy)
 
+        def log_policy() -> None:
+            if location.registers:
+                tracker.log_policy(weights, cell.config, shape, score(evaluation))
 
-def _fixed_seeds(cell: Cell) -> list[int]:
-    first = cell.config.final_eval_first_seed
-    return list(range(first, first + cell.config.final_eval_episodes))
+        def log_table() -> None:
+            _log_table(_evaluate_all(sweep, cell, folder, weights, lambda: episodes), folder, tracker)
+
+        return [
+            Step("the policy's file", log_file),
+            Step("the policy", log_policy),
+            Step("the table of results", log_table),
+        ]
+
+    result = RunSession(folder, cell.config, tracker, RowDisplay(on_row), ClusterOptions()).execute(checkpoint, steps)
+    if not result.is_known:
+        raise RunFailed(f"MLflow does not know that {cell.name} is finished; the same `shoal sweep` tells it")
 
 
 def _evaluate_again(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker) -> None:
     """Evaluates the stored policy of a cell that was done, where the sweep now asks for more setups or episodes."""
     weights = read_saved_policy(folder.policy, cell.config, env_shape(cell.config.env))
-    fixed = evaluate(cell.config.env, weights, _fixed_seeds(cell))
+    fixed = partial(evaluate, cell.config.env, weights, final_seeds(cell.config))
     _log_table(_evaluate_all(sweep, cell, folder, weights, fixed), folder, tracker)
 
 
 def _play_baseline(sweep: SweepConfig, cell: Cell, folder: RunFolder, tracker: Tracker) -> None:
     """Evaluates a baseline."""
-    stats = evaluate(cell.config.env, Baseline(cell.policy), _fixed_seeds(cell))
+    play = partial(evaluate, cell.config.env, Baseline(cell.policy), final_seeds(cell.config))
+    stats = _stored(cell, cell.config, folder, 0, final_seeds(cell.config), play)
     tracker.log_results(as_metrics(summarise(stats)), tracker.started_ms)
-    _log_table([_stored(sweep, cell, cell.config, stats, folder, 0)], folder, tracker)
+    _log_table([result_row(sweep, cell, cell.config.world, stats)], folder, tracker)
 
 
 def _log_table(results: list[ResultRow], folder: RunFolder, tracker: Tracker) -> None:
@@ -203,26 +236,34 @@ def _new_table(folder: RunFolder) -> Path:
 
 
 def _evaluate_all(
-    sweep: SweepConfig, cell: Cell, folder: RunFolder, weights: WeightsSnapshot, fixed: EpisodeStats
+    sweep: SweepConfig,
+    cell: Cell,
+    folder: RunFolder,
+    weights: WeightsSnapshot,
+    play_fixed: Callable[[], EpisodeStats],
 ) -> list[ResultRow]:
-    """Makes the Extrapolation evaluations, and stores them and the Fixed one; returns all rows of results."""
-    config = cell.config
-    results = [_stored(sweep, cell, config, fixed, folder, weights.version)]
+    """Makes the Fixed and the Extrapolation evaluations that are not stored yet; returns all rows of results."""
+    config, updates = cell.config, weights.version
+    stats = _stored(cell, config, folder, updates, final_seeds(cell.config), play_fixed)
+    results = [result_row(sweep, cell, config.world, stats)]
     wanted = wanted_episodes(sweep, cell)
     for world in extrapolation_worlds(sweep, cell):
         seeds = list(range(sweep.first_seed, sweep.first_seed + wanted[world.robots, world.groups]))
         played = dataclasses.replace(config, world=world)
-        results.append(_stored(sweep, cell, played, evaluate(played.env, weights, seeds), folder, weights.version))
+        stats = _stored(cell, played, folder, updates, seeds, partial(evaluate, played.env, weights, seeds))
+        results.append(result_row(sweep, cell, world, stats))
     return results
 
 
 def _stored(
-    sweep: SweepConfig, cell: Cell, played: RunConfig, stats: EpisodeStats, folder: RunFolder, updates: int
-) -> ResultRow:
+    cell: Cell,
+    played: RunConfig,
+    folder: RunFolder,
+    updates: int,
+    seeds: list[int],
+    play: Callable[[], EpisodeStats],
+) -> EpisodeStats:
     world = played.world
     path = folder.path / EVALUATIONS / f"{world.robots}r{world.groups}g.zarr"
     path.parent.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(path, ignore_errors=True)  # from a session that was killed
-    seeds = np.arange(sweep.first_seed, sweep.first_seed + len(stats.outcome))
-    save_evaluation(path, StoredEvaluation(played.env, cell.name, updates, seeds, stats))
-    return result_row(sweep, cell, world, stats)
+    return stored_or_played(path, played.env, cell.name, updates, seeds, play)

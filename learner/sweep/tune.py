@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,6 +26,7 @@ from learner.ray_backend.metrics import RayMetrics
 from learner.sweep.cell import SweepLocation, run_cell
 from learner.sweep.grid import Cell, SweepConfig
 from learner.tracking.journal import Row
+from learner.training.stop_signals import stop_on_signals
 
 ATTEMPTS = 3
 """How often a cell is started at most before it counts as failed."""
@@ -114,8 +116,9 @@ class _Callback(_Unsaved, tune.Callback):
             return
         key, trace = trial.config["cell"], str(trial.get_error() or "its process died")
         path = self._location.cells / key / TRACE
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(trace + "\n")
+        with suppress(OSError):  # the disk may be full, which may be why the cell failed
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(trace + "\n")
         lines = [line for line in trace.splitlines() if line.strip()]
         self._listener.failed(key, f"{lines[-1]} (trace in {path})")
 
@@ -170,7 +173,8 @@ def _fit(
                 verbose=0,
             ),
         )
-        with redirect_stdout(io.StringIO()):  # the listener shows what Tune would print
+        # The listener shows what Tune would print. The loss of the terminal ends a sweep as Ctrl-C does.
+        with redirect_stdout(io.StringIO()), stop_on_signals(signal.SIGHUP) as stop, stop.at_once():
             tuner.fit()
     leave()
 

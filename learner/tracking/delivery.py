@@ -9,10 +9,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from typing import TypeVar
 
 from actors.service.fault_policy import first_line
+from actors.storage.full_disk import DISK_TIMEOUT_S, is_disk_full
 from learner.tracking.journal import Journal, PushedMark, Row
 from learner.tracking.mlflow_run import MLFLOW_ERRORS, Tracker
+
+T = TypeVar("T")
 
 FIRST_PAUSE_S = 1.0
 LONGEST_PAUSE_S = 15.0
@@ -98,22 +102,25 @@ class Delivery:
         return True
 
 
-def retry(call: Callable[[], None], what: str, timeout_s: float, say: Callable[[str], None]) -> None:
-    """Calls MLflow until it answers without an error; after `timeout_s`, raises its last error.
+def retry(call: Callable[[], T], what: str, timeout_s: float, say: Callable[[str], None]) -> T:
+    """Makes a call until neither MLflow nor a full disk refuses it; raises the last error once it has waited too long.
 
     Args:
       call: the call, which may be repeated.
-      what: what it logs, for the message.
-      timeout_s: no further attempt begins after this time.
+      what: what it logs or writes, for the message.
+      timeout_s: no further attempt begins after this time; after `DISK_TIMEOUT_S` where a disk is full.
       say: shows a line to the user.
     """
-    pause_s, deadline_s = FIRST_PAUSE_S, time.monotonic() + timeout_s
+    pause_s, start_s = FIRST_PAUSE_S, time.monotonic()
     while True:
         try:
             return call()
-        except MLFLOW_ERRORS as error:
-            if time.monotonic() + pause_s > deadline_s:
+        except Exception as error:
+            is_full = is_disk_full(error)
+            patience_s = DISK_TIMEOUT_S if is_full else timeout_s
+            if not (is_full or isinstance(error, MLFLOW_ERRORS)) or time.monotonic() + pause_s - start_s > patience_s:
                 raise
-            say(f"MLflow did not take {what}, trying again: {first_line(error)}")
+            reason = "the disk is full, which leaves no room for" if is_full else "MLflow did not take"
+            say(f"{reason} {what}, trying again: {first_line(error)}")
             time.sleep(pause_s)
             pause_s = min(2 * pause_s, LONGEST_PAUSE_S)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 from actors.service.fault_policy import ComponentFailed, Decision, Recovered
+from actors.storage.append_file import AppendFile
 
 DRIVER = "driver"
 Event = Literal["failed", "mended", "resumed"]
@@ -32,11 +34,14 @@ class FaultLog:
     """Appends to the file, each line in one write.
 
     Args:
-      path: the file.
+      path: the file; made at the first fault.
+      say: shows a line to the user.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, say: Callable[[str], None] = lambda text: None) -> None:
         self._path = path
+        self._say = say
+        self._file: AppendFile | None = None
 
     def failed(self, failure: ComponentFailed, decision: Decision) -> None:
         """Records a failure and the decision about it."""
@@ -51,11 +56,15 @@ class FaultLog:
         """Records that a new driver has resumed the run."""
         self._append("resumed", DRIVER, "died", "resume", 1, 0.0)
 
+    def close(self) -> None:
+        """Closes the file."""
+        if self._file is not None:
+            self._file.close()
+
     def _append(self, event: Event, component: str, fault: str, action: str, attempts: int, seconds: float) -> None:
         entry = FaultEntry(time.time(), event, component, str(fault), str(action), attempts, seconds)
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        with self._path.open("a") as file:
-            file.write(json.dumps(entry) + "\n")
+        self._file = self._file or AppendFile(self._path, self._say)
+        self._file.append(json.dumps(entry).encode() + b"\n")
 
 
 def read_faults(path: Path) -> list[FaultEntry]:

@@ -7,10 +7,11 @@ which it was measured. So a row that is pushed twice is stored once, and a resum
 from __future__ import annotations
 
 import json
-import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from actors.storage.append_file import AppendFile
 from actors.storage.atomic_write import replacing_file
 from actors.storage.permissions import may_not_read
 from sim_core.checks import ConfigError
@@ -58,52 +59,47 @@ class Row(NamedTuple):
 
 
 class Journal:
-    """An append-only file of rows, one JSON line each.
+    """An append-only file of rows, one JSON line each; while the disk is full, rows are held in memory.
 
     Args:
       path: the file; made if missing.
       offset: length in bytes that the checkpoint covers; the file is truncated to it.
+      say: shows a line to the user.
 
     Raises:
       ConfigError: the file is shorter than `offset`.
     """
 
-    def __init__(self, path: Path, offset: int) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._path = path
-        self._file = path.open("ab")
-        length = self._file.seek(0, os.SEEK_END)
+    def __init__(self, path: Path, offset: int, say: Callable[[str], None] = lambda text: None) -> None:
+        self._file = AppendFile(path, say)
+        length = self._file.length
         if length < offset:
             self._file.close()
             raise ConfigError(
                 f"{path} has {length} bytes, its checkpoint needs {offset}: restore the whole file or start a new run"
             )
         self._file.truncate(offset)
-        self._file.seek(offset)
 
     def append(self, row: Row) -> None:
         """Writes a row, visible to other processes at once; `sync` makes it durable."""
-        self._file.write(json.dumps(row).encode() + b"\n")
-        self._file.flush()
+        self._file.append(json.dumps(row).encode() + b"\n")
 
     @property
     def length(self) -> int:
-        """Length of the file in bytes."""
-        return self._file.tell()
+        """Length in bytes, with rows that a full disk has not taken yet."""
+        return self._file.length
 
     def sync(self) -> int:
-        """Makes all rows durable; returns the file's length in bytes."""
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        return self._file.tell()
+        """Makes all rows durable; returns the file's length in bytes.
+
+        Raises:
+          OSError: the disk does not take all of them.
+        """
+        return self._file.sync()
 
     def rows(self, start: int = 0, end: int | None = None) -> list[Row]:
         """The rows from byte `start` up to byte `end`, or the end of the file; callable from any thread."""
-        self._file.flush()
-        with self._path.open("rb") as file:
-            file.seek(start)
-            lines = file.read(-1 if end is None else max(0, end - start)).splitlines()
-        return [Row(*json.loads(line)) for line in lines]
+        return [Row(*json.loads(line)) for line in self._file.read(start, end).splitlines()]
 
     def close(self) -> None:
         """Closes the file."""
@@ -137,7 +133,8 @@ class PushedMark:
 
     def __init__(self, path: Path, limit: int) -> None:
         self._path = path
-        self.write(min(limit, self.read()))
+        if self.read() > limit:
+            self.write(limit)
 
     @staticmethod
     def value(path: Path) -> int:

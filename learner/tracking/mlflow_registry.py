@@ -13,10 +13,9 @@ import re
 from typing import Any
 
 from mlflow import MlflowClient
-from mlflow.entities import Dataset, DatasetInput, InputTag
+from mlflow.entities import Dataset, DatasetInput, InputTag, LoggedModel, LoggedModelStatus
 from mlflow.entities.model_registry import ModelVersion
 from mlflow.exceptions import MlflowException
-from mlflow.models.model import ModelInfo
 from mlflow.protos.databricks_pb2 import RESOURCE_ALREADY_EXISTS, ErrorCode
 from mlflow.utils.mlflow_tags import MLFLOW_DATASET_CONTEXT
 
@@ -30,6 +29,12 @@ SCORE = "score"
 """Tag of a version: success rate of the run's final evaluation; mean return where episodes have no outcome."""
 
 
+POLICY_MODEL = "policy"
+"""Name of a run's logged model."""
+UPDATES = "updates"
+"""Tag of a logged model and of a version: number of updates applied to its weights."""
+
+
 def model_name(config: RunConfig) -> str:
     """Name of the registered model for a run's setup; MLflow takes neither all characters nor all lengths of an id."""
     world = config.world
@@ -40,22 +45,37 @@ def model_name(config: RunConfig) -> str:
     return re.sub(r"[^\w.-]", "-", config.env_id)[-MAX_NAME:]
 
 
-def register_policy(client: MlflowClient, config: RunConfig, run_id: str, logged: ModelInfo, score: float) -> None:
-    """Registers a run's logged model as a version of its setup's model, unless the run has a version already.
+def find_policy(client: MlflowClient, experiment_id: str, run_id: str, updates: int) -> LoggedModel | None:
+    """The model that a run has logged after `updates` updates; None if there is none. Removes unfinished ones."""
+    logged = client.search_logged_models([experiment_id], f"source_run_id = '{run_id}'")
+    for model in logged:
+        if model.status != LoggedModelStatus.READY:
+            client.delete_logged_model(model.model_id)  # a kill has left it
+    ready = (model for model in logged if model.status == LoggedModelStatus.READY)
+    return next((model for model in ready if model.tags.get(UPDATES) == str(updates)), None)
+
+
+def register_policy(
+    client: MlflowClient, config: RunConfig, run_id: str, updates: int, model_uri: str, score: float
+) -> None:
+    """Registers a run's logged model as a version of its setup's model, unless that policy of the run has one already.
 
     Args:
       client: client of the store.
       config: the run's config.
       run_id: id of its MLflow run.
-      logged: its logged model.
+      updates: number of updates applied to the policy's weights.
+      model_uri: URI of its logged model.
       score: by which versions are ranked.
     """
     name = model_name(config)
     _ensure_model(client, name)
     versions: list[ModelVersion] = list(client.search_model_versions(f"name = '{name}'"))
-    if all(version.run_id != run_id for version in versions):
-        tags = {SCORE: repr(float(score)), "config_hash": config_hash(config), "seed": str(config.seed)}
-        versions.append(client.create_model_version(name, logged.model_uri, run_id, tags, model_id=logged.model_id))
+    if all((version.run_id, version.tags.get(UPDATES)) != (run_id, str(updates)) for version in versions):
+        tags = {SCORE: repr(float(score)), UPDATES: str(updates), "config_hash": config_hash(config)}
+        tags["seed"] = str(config.seed)
+        model_id = model_uri.rsplit("/", 1)[1]
+        versions.append(client.create_model_version(name, model_uri, run_id, tags, model_id=model_id))
     ranked = [version for version in versions if SCORE in version.tags]
     best = max(ranked, key=lambda version: (float(version.tags[SCORE]), -int(version.version)))
     client.set_registered_model_alias(name, BEST, best.version)

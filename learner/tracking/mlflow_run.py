@@ -47,7 +47,7 @@ from mlflow.protos.databricks_pb2 import RESOURCE_ALREADY_EXISTS, ErrorCode  # n
 from requests import RequestException  # noqa: E402
 from sqlalchemy.exc import SQLAlchemyError  # noqa: E402
 
-from learner.tracking.mlflow_registry import dataset_inputs, register_policy  # noqa: E402
+from learner.tracking.mlflow_registry import POLICY_MODEL, UPDATES, dataset_inputs, find_policy, register_policy  # noqa: E402
 
 MLFLOW_ERRORS = (MlflowException, SQLAlchemyError, RequestException)
 """What MLflow's client raises when its store fails."""
@@ -253,12 +253,20 @@ class Tracker:
     def log_policy(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape, score: float) -> None:
         """Logs and registers the greedy policy's Q-network, a model that maps observations to action values.
 
+        A policy that is logged twice is stored once.
+
         Args:
           weights: the policy's weights.
           config: the run's config.
           shape: shape of its environment.
           score: by which the registry ranks the policies of a setup.
         """
+        logged = find_policy(self._client, self._experiment_id, self.run_id, weights.version)
+        uri = logged.model_uri if logged else self._log_network(weights, config, shape)
+        register_policy(self._client, config, self.run_id, weights.version, uri, score)
+
+    def _log_network(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> str:
+        """Logs the network; returns the model's URI."""
         network = acting_network(config, shape)
         load_snapshot(network, weights)
         example = np.zeros((2, *shape.observation_space.shape), np.float32)
@@ -269,13 +277,14 @@ class Tracker:
             warnings.simplefilter("ignore")  # MLflow warns about its own schema inference
             logged = mlflow.pytorch.log_model(
                 network.eval(),
-                name="policy",
+                name=POLICY_MODEL,
+                tags={UPDATES: str(weights.version)},
                 signature=infer_signature(example, values),
                 input_example=example,
                 serialization_format="pt2",
                 pip_requirements=[f"torch=={torch.__version__.split('+')[0]}", f"numpy=={np.__version__}"],
             )
-        register_policy(self._client, config, self.run_id, logged, score)
+        return str(logged.model_uri)
 
     def log_artifact(self, path: Path) -> None:
         """Uploads a file or a folder to the run's artifacts."""

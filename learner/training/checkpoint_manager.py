@@ -8,6 +8,7 @@ from typing import Any, Protocol
 from actors.rollout.node import RolloutNode
 from actors.service.fault_policy import Component, ComponentFailed, ComponentKind
 from actors.service.rpc import Placed
+from actors.storage.full_disk import is_full
 from actors.storage.uri import Location, join_location
 from learner.checkpoints.checkpoint import Checkpoint, Retention
 from learner.checkpoints.retention import Score, scores_of
@@ -68,6 +69,8 @@ class CheckpointManager:
         self._saved_at: tuple[int, int] | None = None
         self.is_wanted = False
         """Whether a checkpoint is to begin as soon as one can."""
+        self.lacks_space = False
+        """Whether the last checkpoint failed because a disk was full."""
 
     @property
     def saved(self) -> Location | None:
@@ -144,6 +147,7 @@ class CheckpointManager:
         if result is None:
             return None
         position = result.position
+        self.lacks_space = result.location is None and is_full(result.error or "")
         if result.location is None:
             self._observer.checkpoint_failed(position.env_steps, result.error or "")
             self.is_wanted |= result.failure is not None  # a failed storage is not tried again before the next is due

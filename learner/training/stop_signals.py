@@ -1,4 +1,4 @@
-"""Graceful stop: Ctrl-C or SIGTERM ends a run early, with time to write a checkpoint."""
+"""Graceful stop: Ctrl-C, SIGTERM, or the loss of the terminal ends a run early, with time to write a checkpoint."""
 
 from __future__ import annotations
 
@@ -8,12 +8,28 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that stop a run; SIGHUP comes from a terminal that is closed, or a connection that is lost."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal interrupts what has no way to stop gracefully, or not soon enough.
+
+    Args:
+      signal: its number.
+    """
+
+    def __init__(self, signal: int) -> None:
+        super().__init__(signal)
+        self.signal = signal
+
 
 class StopRequest:
     """Remembers the first signal; a second signal that is Ctrl-C interrupts at once."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
+        self._is_at_once = False
 
     def __call__(self) -> bool:
         """Whether a signal has arrived."""
@@ -21,23 +37,47 @@ class StopRequest:
 
     def handle(self, number: int, frame: FrameType | None) -> None:
         """The signal handler."""
-        if self.signal is not None and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        self.signal = number
+        is_second = self.signal is not None
+        self.signal = self.signal or number
+        if self._is_at_once or (is_second and number == signal.SIGINT):
+            raise Interrupted(self.signal)
+
+    def check(self) -> None:
+        """Raises Interrupted if a signal has arrived."""
+        if self.signal is not None:
+            raise Interrupted(self.signal)
+
+    @contextmanager
+    def at_once(self, is_at_once: bool = True) -> Iterator[None]:
+        """Lets every signal interrupt the `with` block, since nothing there asks for the request; False undoes this."""
+        before, self._is_at_once = self._is_at_once, is_at_once
+        try:
+            yield
+        finally:
+            self._is_at_once = before
+
+    def listen(self, numbers: tuple[int, ...]) -> None:
+        """Sets the handlers; again where something else has replaced them, as Ray does when it starts.
+
+        A hang-up that is ignored stays ignored, as `nohup` wants it. Python delivers signals to the main thread only:
+        in another thread, such as a cell of a sweep, no request arrives.
+        """
+        if threading.current_thread() is threading.main_thread():
+            for number in numbers:
+                if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                    signal.signal(number, self.handle)
 
 
 @contextmanager
-def stop_on_signals() -> Iterator[StopRequest]:
-    """Turns SIGINT and SIGTERM into a StopRequest; enter it after Ray has started, since Ray sets handlers of its own.
-
-    Python delivers signals to the main thread only. In another thread, such as a cell of a sweep, no request arrives.
-    """
+def stop_on_signals(*numbers: int) -> Iterator[StopRequest]:
+    """Turns signals, by default Ctrl-C and SIGTERM, into a StopRequest; restores the old handlers."""
+    numbers = numbers or (signal.SIGINT, signal.SIGTERM)
     request = StopRequest()
-    is_main = threading.current_thread() is threading.main_thread()
-    numbers = (signal.SIGINT, signal.SIGTERM) if is_main else ()
-    before = {number: signal.signal(number, request.handle) for number in numbers}
+    before = {number: signal.getsignal(number) for number in numbers}
+    request.listen(numbers)
     try:
         yield request
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in before.items():
+                signal.signal(number, handler)

@@ -295,8 +295,8 @@ class TestWithARun:
 
     def test_missing_checkpoints_are_refused(self, capsys, runs):
         shutil.rmtree(runs / "r" / "checkpoints")
-        for command in ("resume", "evaluate", "watch"):
-            code, error = run(capsys, command, "r", "--runs-dir", str(runs))
+        for command in (["resume", "--total-env-steps", "9000"], ["evaluate"], ["watch"]):
+            code, error = run(capsys, *command, "r", "--runs-dir", str(runs))
             assert code == 2
             assert "no usable checkpoint" in error
 

@@ -50,9 +50,10 @@ def copied(finished: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def runs(copied: Path) -> Path:
-    """A copy of which MLflow knows the run as killed."""
+    """A copy whose run was killed once its last checkpoint was written."""
     client, run = the_run(copied)
     client.set_terminated(run.info.run_id, "KILLED")
+    shutil.rmtree(copied / "r" / "end")
     return copied
 
 

@@ -1,22 +1,29 @@
 """A session of a run: its attempts, what it logs, and the status with which it ends the MLflow run."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from requests import ConnectionError as NoConnection
 
-from actors.policy.policy import WeightsSnapshot
-from actors.service.fault_policy import Component, ComponentFailed, ComponentKind, Fault
+from actors.rollout.vector_env import env_shape
+from actors.service.fault_policy import Component, ComponentFailed, ComponentKind, Fault, RunFailed
 from actors.service.messages import EpisodeStats
 from learner.cluster_options import ClusterOptions
-from learner.run import RunSession
+from learner.run import RunSession, Step
 from learner.run_folder import RunFolder
+from learner.training.cluster import ProcessCluster
 from learner.training.recovery import RunLost
+from learner.update.learner import Learner
 from sim_core.outcomes import Outcome
 
 LOST = ComponentFailed(Component(ComponentKind.LEARNER), 4, Fault.DIED, "simulated")
 EPISODES = EpisodeStats(np.full(2, Outcome.GOAL), np.ones(2, np.int32), np.ones(2))
+
+
+def no_steps(result, rows):
+    return []
 
 
 class FakeTracker:
@@ -51,6 +58,8 @@ class Messages(list):
 def session(tmp_path, small_run, monkeypatch):
     """A session whose attempts end as in `session.outcomes`: True (finished), False (stopped), or an exception."""
     outcomes, incarnations = [], []
+    config = dataclasses.replace(small_run, final_eval_episodes=2)
+    weights = Learner(config, env_shape(config.env)).weights(0.0)._replace(version=7)
 
     class FakeLoop:
         """Ends as the next of `outcomes` says."""
@@ -67,20 +76,20 @@ def session(tmp_path, small_run, monkeypatch):
             return outcome
 
         def newest_weights(self):
-            return WeightsSnapshot(7, 0.0, ())
+            return weights
 
         def lost(self, failure):
             return RunLost(failure, failure.incarnation)
 
     def open_cluster(config, incarnation, place):
         incarnations.append(incarnation)
-        return SimpleNamespace(close=lambda: None)
+        return ProcessCluster(config, incarnation)
 
     monkeypatch.setattr("learner.run.TrainingLoop", FakeLoop)
     monkeypatch.setattr("learner.run.open_cluster", open_cluster)
-    monkeypatch.setattr("learner.run.final_evaluation", lambda config, cluster, weights: EPISODES)
+    monkeypatch.setattr("learner.run.evaluate_in_parallel", lambda *arguments: EPISODES)
     tracker, display = FakeTracker(), Messages()
-    made = RunSession(RunFolder(tmp_path / "r"), small_run, tracker, display, ClusterOptions())
+    made = RunSession(RunFolder(tmp_path / "r"), config, tracker, display, ClusterOptions())
     return SimpleNamespace(
         execute=made.execute, outcomes=outcomes, incarnations=incarnations, tracker=tracker, display=display
     )
@@ -89,16 +98,20 @@ def session(tmp_path, small_run, monkeypatch):
 def test_a_finished_run_is_evaluated_and_logged(session):
     session.outcomes.append(True)
     finished = []
-    result = session.execute(None, lambda result, rows: finished.append((result, rows)))
+
+    def steps(result, rows):
+        return [Step("the artifacts", lambda: finished.append((result, rows)))]
+
+    result = session.execute(None, steps)
     assert (result.env_steps, result.updates, result.stopped_by) == (2_000, 50, None)
-    assert result.evaluation.episodes == 2 and result.episodes is EPISODES and result.weights.version == 7
-    assert finished == [(result, [])]
+    assert result.evaluation.episodes == 2 and result.is_known and result.weights.version == 7
+    assert all(map(np.array_equal, result.episodes, EPISODES)) and len(finished) == 1 and not finished[0][1]
     assert session.tracker.results == [(1.0, 3_000)] and session.tracker.status == "FINISHED"
 
 
 def test_a_lost_learner_leads_to_another_attempt(session):
     session.outcomes += [LOST, True]
-    result = session.execute(None, lambda result, rows: None)
+    result = session.execute(None, no_steps)
     assert result.evaluation is not None and session.tracker.status == "FINISHED"
     assert session.incarnations == [0, 5], "above every incarnation of the first attempt"
     assert "going on from the start" in session.display, "there is no checkpoint"
@@ -108,7 +121,7 @@ def test_a_lost_learner_leads_to_another_attempt(session):
 def test_an_error_ends_the_mlflow_run_with_its_status(session, error, status):
     session.outcomes.append(error)
     with pytest.raises(type(error)):
-        session.execute(None, lambda result, rows: None)
+        session.execute(None, no_steps)
     assert session.tracker.status == status and not session.tracker.results
 
 
@@ -118,15 +131,18 @@ def test_a_store_that_fails_at_the_end_is_reported_and_hides_no_result(session, 
 
     session.outcomes.append(True)
     monkeypatch.setattr(session.tracker, "end", fail)
-    assert session.execute(None, lambda result, rows: None).evaluation is not None
+    result = session.execute(None, no_steps)
+    assert result.evaluation is not None and not result.is_known
     assert "MLflow does not know that the run is FINISHED: away" in session.display
 
 
-def test_artifacts_that_mlflow_refuses_fail_the_run(session):
-    def fail(result, rows):
+def test_artifacts_that_mlflow_refuses_fail_the_run_which_can_be_resumed(session):
+    def fail():
         raise NoConnection("away")
 
     session.outcomes.append(True)
-    with pytest.raises(NoConnection):
-        session.execute(None, fail)
+    with pytest.raises(RunFailed, match=r"its end lacks the artifacts \(away\); `shoal resume .*r` makes it"):
+        session.execute(None, lambda result, rows: [Step("the artifacts", fail)])
     assert session.tracker.status == "FAILED"
+    assert session.execute(None, no_steps).evaluation is not None and session.incarnations == [0], "nothing is trained"
+    assert session.tracker.status == "FINISHED" and len(session.tracker.results) == 1

@@ -1,5 +1,7 @@
 """The log of faults: entries round-trip, and half-written lines of killed drivers are skipped."""
 
+from contextlib import closing
+
 from actors.service.fault_policy import Action, Component, ComponentFailed, ComponentKind, Decision, Fault, Recovered
 from learner.tracking.fault_log import FaultLog, read_faults
 
@@ -8,10 +10,10 @@ WORKER = Component(ComponentKind.WORKER, 2)
 
 def test_entries_round_trip_in_order(tmp_path):
     path = tmp_path / "run" / "faults.jsonl"
-    log = FaultLog(path)
-    log.failed(ComponentFailed(WORKER, 0, Fault.LATE, "silent"), Decision(Action.RESTART, 2))
-    log.recovered(Recovered(WORKER, Fault.LATE, Action.RESTART, 2, 1.5))
-    log.resumed()
+    with closing(FaultLog(path)) as log:
+        log.failed(ComponentFailed(WORKER, 0, Fault.LATE, "silent"), Decision(Action.RESTART, 2))
+        log.recovered(Recovered(WORKER, Fault.LATE, Action.RESTART, 2, 1.5))
+        log.resumed()
     entries = read_faults(path)
     assert [entry[1:] for entry in entries] == [
         ("failed", "rollout worker 2", "late", "restart", 2, 0.0),
@@ -21,15 +23,20 @@ def test_entries_round_trip_in_order(tmp_path):
     assert sorted(entry.time_s for entry in entries) == [entry.time_s for entry in entries]
 
 
+def resume(path):
+    with closing(FaultLog(path)) as log:
+        log.resumed()
+
+
 def test_a_half_written_line_is_skipped_and_spoils_no_other(tmp_path):
     path = tmp_path / "faults.jsonl"
     assert read_faults(path) == []
-    FaultLog(path).resumed()
+    resume(path)
     whole = path.read_text()
     path.write_text(whole + whole[:20])
     assert len(read_faults(path)) == 1
-    FaultLog(path).resumed()  # its line is appended to the half-written one
-    FaultLog(path).resumed()
+    resume(path)  # its line is appended to the half-written one
+    resume(path)
     assert len(read_faults(path)) == 2
     with path.open("a") as file:
         file.write("[" * 100_000 + "\n7\n[1]\n")

@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from learner.training.stop_signals import stop_on_signals
+from learner.training.stop_signals import STOPPING, Interrupted, stop_on_signals
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
 
@@ -49,3 +49,36 @@ def test_the_old_handlers_are_restored(error):
     finally:
         for number, handler in zip(NUMBERS, before, strict=True):
             signal.signal(number, handler)
+
+
+def test_a_lost_terminal_stops_a_run_as_ctrl_c_does_unless_it_is_ignored_as_nohup_does():
+    with stop_on_signals(*STOPPING) as stop:
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert stop() and stop.signal == signal.SIGHUP
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stop_on_signals(*STOPPING) as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not stop()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("number", STOPPING)
+def test_where_nobody_asks_for_the_request_a_signal_interrupts(number):
+    with stop_on_signals(*STOPPING) as stop:
+        with pytest.raises(Interrupted) as caught, stop.at_once():
+            with stop.at_once(False):
+                assert not stop()
+            os.kill(os.getpid(), number)
+        assert caught.value.signal == stop.signal == number
+        with pytest.raises(Interrupted):
+            stop.check()
+
+
+def test_handlers_that_something_else_has_set_are_set_again():
+    with stop_on_signals(*STOPPING) as stop:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # as Ray sets its own
+        stop.listen(STOPPING)
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop()
