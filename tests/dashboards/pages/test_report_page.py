@@ -176,7 +176,7 @@ def test_failures_and_curves_are_drawn(page: Any):
 def test_the_judged_claims_are_shown(page: Any):
     script = """return [...document.querySelectorAll('#claims tr[data-claim]')].map(r => [r.dataset.verdict,
         r.querySelector('.verdict-mark').textContent, r.querySelectorAll('details tbody tr').length])"""
-    marks = {"holds": "✓ holds", "does not hold": "✗ does not hold", "undecided": "? undecided"}
+    marks = {"holds": "✓ holds", "does not hold": "✗ does not hold", "undecided": "? undecided", "no data": "– no data"}
     expected = [[str(c.verdict), marks[str(c.verdict)], len(c.checks)] for c in CLAIMS]
     assert page.execute_script(script) == expected
     assert len({verdict for verdict, _, _ in expected}) > 1
