@@ -238,7 +238,7 @@ def said(text: str) -> Callable[[Job], object]:
 
 def test_real_signals_from_the_first_env_step_to_the_last_step_of_the_end(tmp_path):
     """A terminal that closes during the training, SIGTERM in the evaluation, kill -9 in the end; then a full output."""
-    long = dataclasses.replace(SMALL, total_env_steps=10_000_000, final_eval_episodes=5_000)
+    long = dataclasses.replace(SMALL, total_env_steps=10_000_000, final_eval_episodes=300)
     trains = ("train", "--name", "r", *flags(long))
     code, output = signalled(tmp_path, signal.SIGHUP, lambda job: job.wait_for_checkpoints("r", 1), *trains)
     assert (code, the_status(tmp_path)) == (128 + signal.SIGHUP, "KILLED")
