@@ -10,6 +10,7 @@ from actors.evaluation.conditions import parse_condition, world_under
 from actors.evaluation.evaluator import record_episode
 from actors.evaluation.trajectory import save_episodes
 from actors.policy.policy import WeightsSnapshot
+from actors.rollout.env_guard import env_guard
 from dashboards.figures.film_strip import episode_strip_png
 from dashboards.figures.video import check_video_packages
 from deploy.console.serving import serve_until_interrupted
@@ -19,6 +20,7 @@ from deploy.options.results import Watch
 from deploy.runs.artifacts import foreign_animation, write_player, write_video
 from deploy.runs.folders import make_folder
 from deploy.runs.policy_lookup import find_policy
+from learner.cluster_options import DEADLINE_S
 from learner.config import RunConfig
 from learner.run_folder import find_run
 from sim_core.checks import require
@@ -47,7 +49,8 @@ def run(command: Watch) -> int:
         _render_swarm(config, weights, command, path)
     else:
         require(command.format == "mp4", f"{config.env_id} can only be watched as a video; use --format mp4")
-        foreign_animation(config, weights, command.seed, path)
+        with env_guard(DEADLINE_S):
+            foreign_animation(config, weights, command.seed, path)
     plain_console().print(str(path), soft_wrap=True)
     return 0
 

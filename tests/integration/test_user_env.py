@@ -7,6 +7,7 @@ import mlflow
 import pytest
 
 from deploy.cli import main
+from deploy.commands import watch
 from learner.file_names import ENV_TRACE
 from learner.run_folder import RunFolder
 from tests.integration.conftest import SMALL, flags
@@ -96,10 +97,11 @@ def test_what_comes_later_ends_the_run_with_a_sentence(train, name):
 
 
 @pytest.mark.parametrize("name", ["DrawsGrey", "NeverDraws", "OwnOutcome", "Parts"])
-def test_what_is_only_unusual_is_trained_to_the_end(train, name):
+def test_what_is_only_unusual_is_trained_to_the_end(train, name, monkeypatch):
     code, out, _, folder = train(name, "--deadline-s", "2")
     assert code == 0 and state_of(folder)[0] == "FINISHED"
     assert len([line for line in out.splitlines() if line.startswith("no animation: ")]) == 1
+    monkeypatch.setattr(watch, "DEADLINE_S", 2.0)
     assert main(["watch", str(folder.path), "--format", "mp4"]) == 2
 
 
