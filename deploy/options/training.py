@@ -169,7 +169,7 @@ class Chaos:
     """Mean time between two faults."""
     deadline_s: float = 10.0
     """Seconds of silence after which a component is replaced."""
-    spares: int = 1
+    spares: int = 0
     """Warm spares of the run (see `shoal train`)."""
     limit_s: float = 3_600.0
     """The run counts as hung after this many seconds."""
