@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from actors.evaluation.result_table import GROUPS, ROBOTS
 from actors.policy.baselines import METHOD_RULES
-from actors.rollout.exploration import Exploration
+from actors.rollout.exploration import Exploration, linear_schedule
 from actors.rollout.vector_env import EnvSpec
 from sim_core import ENV_ID
 from sim_core.checks import ConfigError, check_fields, require
@@ -201,13 +201,13 @@ class RunConfig:
 
     def importance_exponent_at(self, env_steps: int) -> float:
         """Exponent of the importance weights after `env_steps` env steps (beta)."""
-        done = min(1.0, env_steps / self.importance_exponent_env_steps)
-        return self.importance_exponent_start + done * (self.importance_exponent_end - self.importance_exponent_start)
+        start, end = self.importance_exponent_start, self.importance_exponent_end
+        return linear_schedule(start, end, self.importance_exponent_env_steps, env_steps)
 
     def teacher_weight_at(self, env_steps: int) -> float:
         """Weight of the losses of the teacher's actions after `env_steps` env steps."""
-        done = min(1.0, env_steps / self.teacher_decay_env_steps)
-        return self.teacher_weight + done * (self.teacher_weight_end - self.teacher_weight)
+        start, end = self.teacher_weight, self.teacher_weight_end
+        return linear_schedule(start, end, self.teacher_decay_env_steps, env_steps)
 
     @property
     def policy_sizes(self) -> tuple[int, ...]:

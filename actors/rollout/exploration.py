@@ -25,6 +25,11 @@ class Exploration(NamedTuple):
     ladder_exponent: float
 
 
+def linear_schedule(start: float, end: float, decay_env_steps: int, env_steps: int) -> float:
+    """Value after `env_steps` env steps: linear from `start` to `end` over `decay_env_steps`, then constant."""
+    return start + min(1.0, env_steps / decay_env_steps) * (end - start)
+
+
 def epsilon(exploration: Exploration, env_steps: int, worker_id: int, workers: int) -> float:
     """Exploration rate of worker `worker_id` of `workers` after `env_steps` env steps of the whole run.
 
@@ -34,8 +39,7 @@ def epsilon(exploration: Exploration, env_steps: int, worker_id: int, workers: i
     if exploration.kind == "ladder":
         rung = worker_id / (workers - 1) if workers > 1 else 0.0
         return float(exploration.ladder_base ** (1 + rung * exploration.ladder_exponent))
-    done = min(1.0, env_steps / exploration.decay_env_steps)
-    return exploration.start + done * (exploration.end - exploration.start)
+    return linear_schedule(exploration.start, exploration.end, exploration.decay_env_steps, env_steps)
 
 
 def draw_random_actions(
