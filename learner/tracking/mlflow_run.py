@@ -261,9 +261,10 @@ class Tracker:
           shape: shape of its environment.
           score: by which the registry ranks the policies of a setup.
         """
-        logged = find_policy(self._client, self._experiment_id, self.run_id, weights.version)
-        uri = logged.model_uri if logged else self._log_network(weights, config, shape)
-        register_policy(self._client, config, self.run_id, weights.version, uri, score)
+        with tracking_at(self.uri):
+            logged = find_policy(self._client, self._experiment_id, self.run_id, weights.version)
+            uri = logged.model_uri if logged else self._log_network(weights, config, shape)
+            register_policy(self._client, config, self.run_id, weights.version, uri, score)
 
     def _log_network(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> str:
         """Logs the network; returns the model's URI."""
@@ -272,7 +273,6 @@ class Tracker:
         example = np.zeros((2, *shape.observation_space.shape), np.float32)
         with torch.no_grad():
             values = network(torch.from_numpy(example)).numpy()
-        mlflow.set_tracking_uri(self.uri)
         with warnings.catch_warnings(), mlflow.start_run(run_id=self.run_id):
             warnings.simplefilter("ignore")  # MLflow warns about its own schema inference
             logged = mlflow.pytorch.log_model(
@@ -319,6 +319,22 @@ class Tracker:
     def end(self, status: str) -> None:
         """Ends the run with the status FINISHED, KILLED or FAILED."""
         self._client.set_terminated(self.run_id, status)
+
+
+@contextmanager
+def tracking_at(uri: str) -> Iterator[None]:
+    """Has MLflow's functions that know no client use the store at `uri`; the process's own store is as before after it.
+
+    The model registry is one of them: without it, it would look for a logged model in the current folder.
+    """
+    before = os.environ.get(VARIABLE)
+    mlflow.set_tracking_uri(uri)
+    try:
+        yield
+    finally:
+        mlflow.set_tracking_uri(None)  # it unsets the variable
+        if before is not None:
+            os.environ[VARIABLE] = before
 
 
 def _only(values: set[int]) -> str:

@@ -10,13 +10,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-import psutil
 import requests
 
 from deploy.chaos.processes import free_port
 from learner.config import RunConfig
 from tests.integration.conftest import PATIENCE_S, clean_environment, flags
-from tests.integration.jobs import wait_for
+from tests.integration.jobs import kill, wait_for
 
 ROOT = Path(__file__).parents[2]
 HEAD_PORTS = ("port", "dashboard-port", "ray-client-server-port")
@@ -124,13 +123,6 @@ def joined_node(head: Head, log: Path, *words: str) -> Iterator[subprocess.Popen
         finally:
             if node.poll() is None:
                 kill(node)
-
-
-def kill(node: subprocess.Popen) -> None:
-    """Takes a node, or a driver, away as a power cut does: all of its processes at once."""
-    for process in [*psutil.Process(node.pid).children(recursive=True), psutil.Process(node.pid)]:
-        process.kill()
-    node.wait(PATIENCE_S)
 
 
 def copy_of_the_code(folder: Path) -> Path:

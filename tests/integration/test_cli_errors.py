@@ -21,6 +21,7 @@ from deploy.cli import main, parse
 from learner.checkpoints.manifest import decode_manifest, encode_manifest
 from learner.presets import preset_config
 from learner.run_folder import RunFolder
+from learner.tracking.mlflow_run import tracking_at
 from tests.integration.conftest import SMALL, flags
 
 
@@ -225,9 +226,8 @@ class TestWithARun:
         before = (finished / "mlflow.db").read_bytes()
         assert run(capsys, "relocate", "--runs-dir", str(moved)) == (0, "")
         uri = f"sqlite:///{moved / 'mlflow.db'}"
-        mlflow.set_tracking_uri(uri)
-        place = Path(mlflow.artifacts.download_artifacts("models:/sensor-3r-2g@best", dst_path=tmp_path / "model"))
-        mlflow.set_tracking_uri(None)
+        with tracking_at(uri):
+            place = Path(mlflow.artifacts.download_artifacts("models:/sensor-3r-2g@best", dst_path=tmp_path / "model"))
         assert (place / "MLmodel").is_file()
         assert main(["resume", "r", "--runs-dir", str(moved), "--total-env-steps", "6500"]) == 0
         identity = RunFolder(moved / "r").identity()

@@ -11,7 +11,6 @@ import threading
 import urllib.request
 from contextlib import closing, contextmanager
 
-import mlflow
 import numpy as np
 import pytest
 
@@ -62,7 +61,6 @@ def sweep(tmp_path_factory):
     Tracker(uri, "cells", str(folder.parent / "artifacts"))
     place = SweepLocation(folder / "cells", uri, "cells")
     tables = [run_cell(SWEEP, cell, place, lambda row: None) for cell in make_cells(SWEEP)]
-    mlflow.set_tracking_uri(None)
     write_table(folder / "results.csv", [row for table in tables for row in read_table(table)])
     return folder
 

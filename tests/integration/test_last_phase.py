@@ -65,13 +65,6 @@ def assert_whole(folder: Path, expected: dict[str, float], rows: str) -> None:
     assert not list(folder.rglob("*.part"))
 
 
-@pytest.fixture(scope="module", autouse=True)
-def no_store_is_left():
-    """MLflow keeps the store of the last logged model for all of this process."""
-    yield
-    mlflow.set_tracking_uri(None)
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The result's metrics of a run that nothing cut."""

@@ -64,7 +64,7 @@ def test_a_removed_node_costs_no_run(cluster, tmp_path):
     folder.save_identity(RunIdentity("r", tracker.uri, "faults", tracker.run_id))
     display = NodeRemover(remove, 5_000)
     options = ClusterOptions(cluster.address, 30.0, 200.0)
-    result = RunSession(folder, config, tracker, display, options).execute(None, lambda result, rows: None)
+    result = RunSession(folder, config, tracker, display, options).execute(None, lambda result, rows: [])
     assert result.env_steps >= 30_000 and result.evaluation is not None, display.messages
     log = read_faults(folder.faults)
     assert {entry.event for entry in log} >= {"failed", "mended"}, display.messages

@@ -112,7 +112,6 @@ def test_bad_trials_end_at_a_rung_and_the_search_goes_on(tmp_path):
     }
     cells = client.search_runs([client.get_experiment_by_name("s cells").experiment_id])
     assert {run.info.status for run in cells} == {"FINISHED", "KILLED"}
-    mlflow.set_tracking_uri(None)
 
 
 @pytest.mark.parametrize(

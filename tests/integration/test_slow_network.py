@@ -15,9 +15,9 @@ from learner.checkpoints.store import env_steps_of
 from learner.run_folder import RunFolder
 from learner.tracking.fault_log import read_faults
 from tests.integration.conftest import PATIENCE_S, SMALL, clean_environment, flags
-from tests.integration.jobs import wait_for
+from tests.integration.jobs import kill, wait_for
 from tests.integration.machines import SlowCable, at, machines
-from tests.integration.ray_head import ROOT, kill, ray_start, short_folder, with_token
+from tests.integration.ray_head import ROOT, ray_start, short_folder, with_token
 
 pytestmark = [
     pytest.mark.ray,

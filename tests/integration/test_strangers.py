@@ -15,8 +15,9 @@ from typing import NamedTuple
 
 import pytest
 
+from tests.integration.jobs import kill
 from tests.integration.machines import at, connect, machines, on, root
-from tests.integration.ray_head import ROOT, copy_of_the_code, kill, ray_start, short_folder, with_token
+from tests.integration.ray_head import ROOT, copy_of_the_code, ray_start, short_folder, with_token
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 

@@ -10,8 +10,8 @@ from deploy.chaos.invariants import broken_invariants
 from learner.run_folder import RunFolder
 from learner.tracking.fault_log import read_faults
 from tests.integration.conftest import SMALL
-from tests.integration.jobs import wait_for
-from tests.integration.ray_head import copy_of_the_code, finish, joined_node, kill, running_head, submit
+from tests.integration.jobs import kill, wait_for
+from tests.integration.ray_head import copy_of_the_code, finish, joined_node, running_head, submit
 
 pytestmark = [
     pytest.mark.ray,

@@ -44,7 +44,6 @@ def rows(tmp_path_factory):
     Tracker(uri, "cells", str(folder / "artifacts"))
     place = SweepLocation(folder / "cells", uri, "cells")
     tables = [run_cell(SWEEP, cell, place, lambda row: None) for cell in make_cells(SWEEP)]
-    mlflow.set_tracking_uri(None)
     return sorted(row for table in tables for row in read_table(table))
 
 

@@ -18,8 +18,7 @@ pytestmark = [
 ]
 
 
-def test_it_trains_resumes_and_is_registered_in_mlflow(tmp_path, monkeypatch):
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)  # MLflow sets it when a run of this process logs a model
+def test_it_trains_resumes_and_is_registered_in_mlflow(tmp_path):
     config = dataclasses.replace(SMALL, env_id="tests.own_env:Line-v0")
     assert main(["train", "--runs-dir", str(tmp_path), *flags(config)]) == 0
     (path,) = (path.parent for path in tmp_path.glob("*/config.json"))
@@ -52,9 +51,8 @@ def runs(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def train(runs, monkeypatch, capsys):
+def train(runs, capsys):
     """Function: trains with an odd environment; gives the exit code, what was printed, the sentence and the folder."""
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
 
     def train(name, *more, config=SMALL, **settings):
         config = dataclasses.replace(config, env_id=f"tests.odd_envs:{name}-v0", **settings)

@@ -36,8 +36,7 @@ def place(tmp_path):
     found.folder.mkdir()
     for experiment in (found.experiment, found.cells_experiment):
         Tracker(uri, experiment, str(tmp_path / "artifacts"))
-    yield found
-    mlflow.set_tracking_uri(None)
+    return found
 
 
 def search_of(*space, budget="4", **settings):

@@ -34,8 +34,7 @@ def store(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mlflow")
     uri = f"sqlite:///{folder / 'mlflow.db'}"
     Tracker(uri, "cells", str(folder / "artifacts"))
-    yield uri
-    mlflow.set_tracking_uri(None)
+    return uri
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 
 from learner.tracking import local_store
 from learner.tracking.local_store import database_of, find_store, mend_locations, sqlite_uri
-from learner.tracking.mlflow_run import Tracker
+from learner.tracking.mlflow_run import Tracker, tracking_at
 from learner.tracking.redaction import VARIABLE
 from sim_core.checks import ConfigError
 
@@ -82,10 +82,9 @@ def made(tmp_path_factory):
     model = tracker._client.create_logged_model(tracker._experiment_id, "policy", run_id)
     (Path(model.artifact_location)).mkdir(parents=True)
     (Path(model.artifact_location) / "MLmodel").write_text("flavors: {}")
-    mlflow.set_tracking_uri(tracker.uri)  # where the registry looks for the model
-    tracker._client.create_registered_model("m")
-    tracker._client.create_model_version("m", f"models:/{model.model_id}", run_id, model_id=model.model_id)
-    mlflow.set_tracking_uri(None)
+    with tracking_at(tracker.uri):
+        tracker._client.create_registered_model("m")
+        tracker._client.create_model_version("m", f"models:/{model.model_id}", run_id, model_id=model.model_id)
     (old / "r").mkdir()
     return old, run_id
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import os
 import time
 
 import mlflow
@@ -13,7 +14,7 @@ from actors.policy.policy import Policy
 from actors.rollout.vector_env import env_shape
 from learner.config import RunConfig, config_hash, flat_params
 from learner.tracking.journal import Row
-from learner.tracking.mlflow_run import Tracker, check_reachable, git_commit
+from learner.tracking.mlflow_run import Tracker, check_reachable, git_commit, tracking_at
 from learner.tracking.redaction import VARIABLE
 from learner.update.learner import Learner
 from sim_core.checks import ConfigError
@@ -27,8 +28,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy i
 def store(tmp_path_factory):
     """(tracking URI, artifact folder) of one database for all tests: making it takes seconds."""
     folder = tmp_path_factory.mktemp("mlflow")
-    yield f"sqlite:///{folder / 'mlflow.db'}", str(folder / "artifacts")
-    mlflow.set_tracking_uri(None)
+    return f"sqlite:///{folder / 'mlflow.db'}", str(folder / "artifacts")
 
 
 @pytest.fixture
@@ -188,12 +188,11 @@ def test_the_logged_policy_gives_the_same_values(tracker, policy, small_run):
     weights, shape = policy
     tracker.log_policy(weights, small_run, shape, 0.5)
     observation = np.random.default_rng(0).integers(-5, 6, (7, shape.observation_size)).astype(np.float32)
-    mlflow.set_tracking_uri(tracker.uri)
     model_uri = f"runs:/{tracker.run_id}/policy"
-    with torch.no_grad():
+    with torch.no_grad(), tracking_at(tracker.uri):
         values = mlflow.pytorch.load_model(model_uri)(torch.from_numpy(observation)).numpy()
+        info = mlflow.models.get_model_info(model_uri)
     np.testing.assert_allclose(values, Policy(weights).values(observation), rtol=1e-5, atol=1e-6)
-    info = mlflow.models.get_model_info(model_uri)
     assert info.signature.inputs.inputs[0].shape == (-1, shape.observation_size)
     assert info.signature.outputs.inputs[0].shape == (-1, shape.num_actions)
     assert mlflow.active_run() is None
@@ -214,11 +213,26 @@ def test_the_registry_has_one_version_a_run_and_an_alias_for_the_best(store, pol
     assert {version.run_id: float(version.tags["score"]) for version in versions} == runs and len(versions) == 4
     best = client.get_model_version_by_alias("sensor-4r-3g", "best")
     assert best.run_id == list(runs)[1]
-    model = mlflow.pytorch.load_model("models:/sensor-4r-3g@best")
+    with tracking_at(store[0]):
+        model = mlflow.pytorch.load_model("models:/sensor-4r-3g@best")
     example = np.ones((1, shape.observation_size), np.float32)
     with torch.no_grad():
         values = model(torch.from_numpy(example)).numpy()
     np.testing.assert_allclose(values, Policy(weights).values(example), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("own", [None, "sqlite:///own.db"])
+def test_the_processs_own_store_is_left_alone(tracker, policy, small_run, tmp_path, monkeypatch, own):
+    monkeypatch.chdir(tmp_path)
+    if own is None:
+        monkeypatch.delenv(VARIABLE, raising=False)
+    else:
+        monkeypatch.setenv(VARIABLE, own)
+    weights, shape = policy
+    for _ in range(2):  # the second finds the policy logged, as a resumed end does
+        tracker.log_policy(weights, small_run, shape, 0.5)
+        assert os.environ.get(VARIABLE) == own and mlflow.is_tracking_uri_set() == (own is not None)
+    assert not list(tmp_path.iterdir()), "the registry looks for the model in the run's store"
 
 
 def test_the_episodes_of_training_and_evaluation_are_datasets(store, small_run):
