@@ -95,7 +95,10 @@ class RunConfig:
     """One stream; two, for state value and advantages, from the last hidden layer on (Wang et al. 2016); or, for in and
     out, layers that the other groups' rows share, and their maximum (Zaheer et al. 2017); the first width is theirs."""
     discount: float = 0.99
-    """Discount per env step, gamma (the dissertation's lambda = 0.001 cannot be a discount)."""
+    """Discount per decision, gamma (the dissertation's lambda = 0.001 cannot be a discount)."""
+    discount_time_s: float = 0.0
+    """Time constant of the discount, s, in place of `discount`: exp(-t / discount_time_s) means the same whatever a
+    decision lasts; 0: none."""
     n_step: int = 3
     """Env steps that a transition spans (n-step return)."""
     random_turns: bool = False
@@ -158,6 +161,7 @@ class RunConfig:
         _check_ranges(self)
         _check_pairs(self)
         _check_setups(self)
+        _check_discount(self)
         _check_network(self)
         _check_augmentation(self)
         _check_teacher(self)
@@ -208,6 +212,13 @@ class RunConfig:
         """Weight of the losses of the teacher's actions after `env_steps` env steps."""
         start, end = self.teacher_weight, self.teacher_weight_end
         return linear_schedule(start, end, self.teacher_decay_env_steps, env_steps)
+
+    @property
+    def decision_discount(self) -> float:
+        """Discount of a decision, gamma."""
+        if self.discount_time_s == 0:
+            return self.discount
+        return math.exp(-self.world.decision_interval_steps * self.world.time_step_s / self.discount_time_s)
 
     @property
     def policy_sizes(self) -> tuple[int, ...]:
@@ -319,6 +330,18 @@ def _check_network(config: RunConfig) -> None:
             config.env.row_size > 0,
             f"network must be plain or dueling for {config.title}, whose observations are no rows of groups; pooled is "
             "for methods in and out",
+        )
+
+
+def _check_discount(config: RunConfig) -> None:
+    if config.discount_time_s != 0:
+        require(
+            config.env.is_swarm,
+            f"discount_time_s must be 0 for {config.env_id}, whose steps have no duration; set discount",
+        )
+        require(
+            config.discount_time_s > 0 and config.decision_discount > 0,
+            f"discount_time_s must be 0 or long enough for a discount above 0, not {config.discount_time_s}",
         )
 
 

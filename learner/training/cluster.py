@@ -33,7 +33,7 @@ def rollout_settings(config: RunConfig) -> RolloutSettings:
         num_envs=config.envs_per_worker,
         steps_per_block=config.steps_per_block,
         n_step=config.n_step,
-        discount=config.discount,
+        discount=config.decision_discount,
         seed=config.seed,
     )
 

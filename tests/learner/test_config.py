@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from learner.config import AT_LEAST_ONE, RunConfig, config_hash, from_dict, to_dict
+from learner.training.cluster import rollout_settings
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 
@@ -35,6 +36,7 @@ def test_counts_must_be_positive_whole_numbers(name, value):
         ("ladder_base", [-0.1, 1.1, None]),
         ("ladder_exponent", [-1, math.nan, math.inf]),
         ("discount", [0, -0.5, 1.01, math.nan, True]),
+        ("discount_time_s", [-1, 1e-9, math.nan, math.inf, "2"]),
         ("samples_per_insert", [0, -1, math.nan, math.inf, "4"]),
         ("learning_rate", [0, -1, math.nan, math.inf]),
         ("learning_rate_end", [0, -1, math.nan, math.inf]),
@@ -102,6 +104,7 @@ OTHER = WorldConfig(method="in")
             "random_turns must be False for method sensor with these settings",
         ),
         ({"setups": "all"}, "setups must be a list of texts such as 10x2, not 'all'"),
+        ({"env_id": "CartPole-v1", "discount_time_s": 2.0}, "no duration; set discount"),
     ],
 )
 def test_values_that_contradict_each_other_are_refused(settings, words):
@@ -123,6 +126,15 @@ def test_all_setups_are_those_of_the_dissertation():
 def test_limits_themselves_are_accepted():
     RunConfig(replay_capacity=32_768, min_replay=32_768, replay_shards=4, total_env_steps=32_769)
     RunConfig(seed=2**31 - 1, discount=1.0, epsilon_start=0.0, epsilon_end=1, ladder_base=1, ladder_exponent=0)
+
+
+@pytest.mark.parametrize(("interval", "step_s"), [(1, 0.05), (4, 0.05), (3, 0.1)])
+def test_a_discount_of_time_is_the_same_after_a_second_whatever_a_decision_lasts(interval, step_s):
+    world = WorldConfig(decision_interval_steps=interval, time_step_s=step_s)
+    config = RunConfig(world=world, discount=0.5, discount_time_s=2.0)
+    assert config.decision_discount ** (1 / (interval * step_s)) == pytest.approx(math.exp(-0.5))
+    assert rollout_settings(config).discount == config.decision_discount
+    assert RunConfig(discount=0.5).decision_discount == 0.5
 
 
 def test_the_learning_rate_falls_linearly_and_stays():
@@ -219,6 +231,7 @@ def changed(config, name):
         "setups": ("4x2", "5x1"),
         "random_turns": True,
         "teacher": "greedy",
+        "discount_time_s": 2.0,
     }
     if name not in others:
         others[name] = value + 1 if isinstance(value, int) else value / 2

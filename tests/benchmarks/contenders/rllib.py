@@ -23,7 +23,7 @@ def algorithm(heat: Heat):
         )
         .training(
             lr=[[0, config.learning_rate], [config.learning_rate_decay_env_steps, config.learning_rate_end]],
-            gamma=config.discount,
+            gamma=config.decision_discount,
             train_batch_size_per_learner=config.batch_size,
             num_steps_sampled_before_learning_starts=config.min_replay,
             target_network_update_freq=target_every_env_steps(config),

@@ -84,7 +84,7 @@ def train(heat: Heat) -> Finding:
         buffer_size=config.replay_capacity,
         learning_starts=config.min_replay,
         batch_size=config.batch_size,
-        gamma=config.discount,
+        gamma=config.decision_discount,
         n_steps=config.n_step,
         train_freq=beat.vector_steps,
         gradient_steps=beat.updates,

@@ -45,7 +45,7 @@ def train(heat: Heat) -> Finding:
         storage=LazyTensorStorage(config.replay_capacity), batch_size=config.batch_size, prefetch=2
     )
     loss_module = DQNLoss(actor, loss_function="smooth_l1", delay_value=True, double_dqn=True)
-    loss_module.make_value_estimator(gamma=config.discount)
+    loss_module.make_value_estimator(gamma=config.decision_discount)
     target = HardUpdate(loss_module, value_network_update_interval=config.target_update_interval)
     optimizer = torch.optim.Adam(loss_module.parameters(), lr=config.learning_rate)
     lap, env_steps, updates = Lap(heat), 0, 0
