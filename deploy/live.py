@@ -34,7 +34,7 @@ class LiveRun:
     def page(self, query: Mapping[str, str]) -> str:
         """The page with the player."""
         title = f"{self._folder.path.name}: {self._config.name}, live"
-        return player_page(title, {}, "live.js", SERVED)
+        return player_page(title, {}, ["request.js", "live.js"], SERVED)
 
     def episode(self, query: Mapping[str, str]) -> dict[str, Any]:
         """Episode `number` of the newest policy, and after how many updates that policy was published.

@@ -49,6 +49,20 @@ class Pilot(enum.Enum):
     """It takes the action whose velocity is nearest to FL-ORCA's."""
 
 
+class Command(NamedTuple):
+    """Velocities for the learning robots that are given from outside: by a person, or any other controller.
+
+    They take the place of an action's; shield and errors of driving apply as to those.
+    """
+
+    velocity: NDArray[np.float32]
+    """`[2, num_worlds]`, m/s."""
+
+
+Decision = NDArray[np.int64] | Pilot | Command
+"""Actions `[num_worlds]`, how FL-ORCA drives the learning robot too, or given velocities."""
+
+
 class StepResult(NamedTuple):
     """What a decision leads to, one entry a world.
 
@@ -142,23 +156,25 @@ class WorldBatch:
             frames = frames.reshape(self.num_worlds, self.config.history, -1, rows).swapaxes(1, 2)
         return frames.reshape(self.num_worlds, -1).copy()
 
-    def step(self, action: NDArray[np.int64] | Pilot, watch: Callable[[], None] | None = None) -> StepResult:
+    def step(self, action: Decision, watch: Callable[[], None] | None = None) -> StepResult:
         """Takes one decision in every world: `decision_interval_steps` simulator steps with the same action.
 
         A world whose episode ends within the interval stays as it ended. Ended worlds are not restarted.
 
         Args:
-          action: `[num_worlds]`, or how FL-ORCA drives the learning robot too.
+          action: what the learning robots do.
           watch: called after each simulator step.
 
         Returns:
           StepResult of copies.
 
         Raises:
-          ValueError: there is not one action a world, or one is none of the actions.
+          ValueError: there is not one action or velocity a world, or one is none of the actions.
         """
         if action is Pilot.SNAPPED:
             action = self.actions_nearest_to_swarm()
+        if isinstance(action, Command) and action.velocity.shape != self._command.shape:
+            raise ValueError(f"velocities must be {self._command.shape}, not {action.velocity.shape}")
         self._running.fill(True)
         self._reward.fill(0.0)
         for left in range(self.config.decision_interval_steps - 1, -1, -1):
@@ -182,7 +198,7 @@ class WorldBatch:
             self._history[:, 1:] = self._history[:, :-1].copy()
             self._history[:, 0] = self._observation
 
-    def _simulate(self, action: NDArray[np.int64] | Pilot) -> bool:
+    def _simulate(self, action: Decision) -> bool:
         """Moves the running worlds by one simulator step and adds its rewards; returns whether any still runs."""
         state, running = self.state, self._running
         is_given = self._give_command(action)
@@ -193,18 +209,19 @@ class WorldBatch:
             self._senses.sense(running)
         return bool(_end_step(running, self._outcome, self.step_reward, self._reward))
 
-    def _give_command(self, action: NDArray[np.int64] | Pilot) -> bool:
+    def _give_command(self, action: Decision) -> bool:
         """Writes the velocities that the learning robots drive; returns False where FL-ORCA drives as it is."""
-        command = self._command
-        if self._senses is None and self._shield is None:
-            if isinstance(action, Pilot):
-                return False
-            self.method.velocity(self.state, action, self._command_x, self._command_y)
-            return True
+        command, as_asked = self._command, self._senses is None and self._shield is None
         if isinstance(action, Pilot):
+            if as_asked:
+                return False
             command[:] = self._swarm_velocity()
+        elif isinstance(action, Command):
+            command[:] = action.velocity
         else:
             self.method.velocity(self.sensed, action, self._command_x, self._command_y)
+        if as_asked:
+            return True
         self.asked[:] = command
         if self._shield is not None:
             self._shield.project(self.sensed, self._running, self._command_x, self._command_y)

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.evaluation.trajectory import NO_ACTION, Episode
+from actors.evaluation.recording import Recording
+from actors.evaluation.trajectory import Episode
 from actors.policy.baselines import ActionRule, Baseline, make_baseline
 from actors.policy.policy import Policy, WeightsSnapshot
 from actors.rollout.foreign_env import EnvError, ForeignVectorEnv
@@ -237,39 +238,10 @@ def _play(spec: EnvSpec, rule: ActionRule, seeds: list[int]) -> EpisodeStats:
 
 def record_episode(spec: EnvSpec, candidate: Candidate, seed: int) -> Episode:
     """Plays one episode of the swarm environment and records the state after every simulator step."""
-    worlds = WorldBatch(spec.world, 1)
-    rule = make_action_rule(spec, candidate, [seed])
-    worlds.seed([seed])
-    observation = worlds.reset()
-    states, actions, rewards = [_state_of(worlds)], list[int](), list[float]()
-    sensed, asked = [worlds.sensed_positions()[0]], list[NDArray[np.float32]]()
-    outcome = Outcome.RUNNING
-
-    def record() -> None:
-        states.append(_state_of(worlds))
-        actions.append(NO_ACTION if isinstance(action, Pilot) else int(action[0]))
-        rewards.append(float(worlds.step_reward[0]))
-        sensed.append(worlds.sensed_positions()[0])
-        asked.append(worlds.asked[:, 0].copy())
-
-    while outcome == Outcome.RUNNING:
-        action = rule.act(observation)
-        result = worlds.step(action, record)
-        observation, outcome = result.observation, Outcome(result.outcome[0])
-    position, velocity, machine = (np.stack(column) for column in zip(*states, strict=True))
-    return Episode(
-        position=position,
-        velocity=velocity,
-        machine=machine,
-        action=np.array([*actions, NO_ACTION], np.int64),
-        reward=np.array([*rewards, 0.0], np.float32),
-        goal=worlds.goals()[0],
-        learner=int(worlds.state.learner[0]),
-        outcome=int(outcome),
-        seed=seed,
-        **({"sensed": np.stack(sensed)} if spec.world.senses_badly else {}),
-        **({"asked": np.stack([*asked, np.zeros(2, np.float32)])} if spec.world.shield != "none" else {}),
-    )
+    recording, rule = Recording(spec.world, seed), make_action_rule(spec, candidate, [seed])
+    while recording.outcome == Outcome.RUNNING:
+        recording.step(rule.act(recording.observation))
+    return recording.episode()
 
 
 def record_frames(spec: EnvSpec, weights: WeightsSnapshot, seed: int) -> tuple[Iterator[NDArray[np.uint8]], float]:
@@ -313,8 +285,3 @@ def _image(env: ForeignVectorEnv) -> NDArray[np.uint8]:
     require(bool(is_image), f"env_id {env.env_id!r}: render() gave {what}, no RGB image [height, width, 3] uint8")
     drawn: NDArray[np.uint8] = image
     return drawn
-
-
-def _state_of(worlds: WorldBatch) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    velocity = np.stack([worlds.state.vel_x[0], worlds.state.vel_y[0]], axis=-1)
-    return worlds.positions()[0], velocity, worlds.state.machine[0].copy()

@@ -21,6 +21,8 @@ from sim_core.config import WorldConfig
 FORMAT = "shoal-trajectories-1"
 NO_ACTION = -1
 """Action of a step in which FL-ORCA drove the learning robot, and of the final state."""
+BY_HAND = -2
+"""Action of a step in which a person drove the learning robot."""
 
 
 class Episode(NamedTuple):
@@ -47,6 +49,11 @@ class Episode(NamedTuple):
     seed: int
     sensed: NDArray[np.float32] = np.zeros((0, 0, 2), np.float32)
     asked: NDArray[np.float32] = np.zeros((0, 2), np.float32)
+
+    @property
+    def is_piloted(self) -> bool:
+        """Whether actions or a person drove the learning robot, not FL-ORCA."""
+        return bool((self.action[:-1] != NO_ACTION).any())
 
 
 TIME_KEYS = ("position", "velocity", "machine", "action", "reward")

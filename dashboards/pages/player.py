@@ -7,6 +7,7 @@ states in units of half a millimetre or more. Velocities are not stored: they ar
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,16 +53,16 @@ def player_html(episode: Episode, config: WorldConfig, title: str) -> str:
     Raises:
       ValueError: the positions are not finite, or not those of `config.num_robots` robots.
     """
-    return player_page(title, player_data(episode, config), "player_page.js", OFFLINE)
+    return player_page(title, player_data(episode, config), ["player_page.js"], OFFLINE)
 
 
-def player_page(title: str, data: dict[str, Any], script: str, policy: str) -> str:
-    """A document with the player, and a script that loads the episodes to play.
+def player_page(title: str, data: dict[str, Any], scripts: Sequence[str], policy: str) -> str:
+    """A document with the player, and scripts that load the episodes to play.
 
     Args:
       title: plain text; it is escaped.
       data: JSON for the script, in the element `data`.
-      script: name of the script's file in `dashboards/web`.
+      scripts: names of their files in `dashboards/web`.
       policy: content security policy.
     """
     return document(
@@ -71,7 +72,7 @@ def player_page(title: str, data: dict[str, Any], script: str, policy: str) -> s
         "player.html",
         stage=assets("stage.html"),
         data=embedded(data),
-        js=assets(*PLAYER_JS, script),
+        js=assets(*PLAYER_JS, *scripts),
     )
 
 
@@ -110,7 +111,7 @@ def player_data(episode: Episode, config: WorldConfig) -> dict[str, Any]:
         "metres_per_unit": metres_per_unit,
         "machine": packed(episode.machine.astype(np.uint8).tobytes()),
         "actions": packed(episode.action.astype(np.int8).tobytes()),
-        "piloted": bool((episode.action[:-1] >= 0).any()),
+        "piloted": episode.is_piloted,
         "goals": [[round(float(x), 4), round(float(y), 4)] for x, y in episode.goal],
         "learner": episode.learner,
         "steps": steps,

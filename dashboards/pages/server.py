@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import threading
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
@@ -21,6 +22,9 @@ Answer = Callable[[Query], Any]
 
 A LookupError is answered by 404, a ConfigError, ValueError or OSError by 409, each with its message as JSON.
 """
+Change = Callable[[Mapping[str, Any]], Any]
+"""Answers a request that changes something, from the JSON object that it sends; else as `Answer`."""
+LONGEST_CHANGE_BYTES = 4096
 
 
 def episode_number(query: Query) -> int:
@@ -36,22 +40,28 @@ class PageServer:
 
     Requests are answered one at a time, so that answers need not be thread-safe. Requests with another Host header are
     refused: otherwise a foreign page could read the data by pointing its own host name to 127.0.0.1 (DNS rebinding).
+    Requests that change something must be POSTs of JSON, which browsers let no foreign page send.
 
     Args:
       answers: the answer of each path, such as `/` and `/data.json`.
       port: the port to listen on; 0 takes a free one.
+      changes: the answer of each path that changes something.
 
     Raises:
       ConfigError: the port is taken.
     """
 
-    def __init__(self, answers: Mapping[str, Answer], port: int) -> None:
+    def __init__(self, answers: Mapping[str, Answer], port: int, changes: Mapping[str, Change] | None = None) -> None:
         lock = threading.Lock()
 
         class Handler(_Handler):
             def answer(self, path: str, query: Query) -> Any:
                 with lock:
                     return answers[path](query)
+
+            def change(self, path: str, values: Mapping[str, Any]) -> Any:
+                with lock:
+                    return (changes or {})[path](values)
 
         try:
             self._server = ThreadingHTTPServer((HOST, port), Handler)
@@ -76,20 +86,42 @@ class PageServer:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Handles GET requests, one per connection; the server's subclass answers them."""
+    """Handles requests, one per connection; the server's subclass answers them."""
 
     def answer(self, path: str, query: Query) -> Any:
         """The answer to a request; see `Answer`."""
         raise NotImplementedError
 
+    def change(self, path: str, values: Mapping[str, Any]) -> Any:
+        """The answer to a request that changes something; see `Change`."""
+        raise NotImplementedError
+
     def do_GET(self) -> None:
         """Sends the answer, or an error as JSON."""
+        parts = urlsplit(self.path)
+        self._respond(lambda: self.answer(parts.path, dict(parse_qsl(parts.query))))
+
+    def do_POST(self) -> None:
+        """Changes what the request asks for and sends the answer, or an error as JSON."""
+        self._respond(lambda: self.change(urlsplit(self.path).path, self._sent()))
+
+    def _sent(self) -> Mapping[str, Any]:
+        """The JSON object that the request sends; raises ValueError if it sends something else."""
+        length = self.headers.get("Content-Length", "")
+        is_short = length.isdecimal() and int(length) <= LONGEST_CHANGE_BYTES
+        if self.headers.get_content_type() != "application/json" or not is_short:
+            raise ValueError(f"send a JSON object of at most {LONGEST_CHANGE_BYTES} bytes as application/json")
+        values = json.loads(self.rfile.read(int(length)))
+        if not isinstance(values, dict):
+            raise ValueError("send a JSON object")
+        return values
+
+    def _respond(self, answer: Callable[[], Any]) -> None:
         host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
         if host not in (HOST, "localhost"):
             return self._send(HTTPStatus.FORBIDDEN, {"error": f"this server is {HOST}, not {host}"})
-        parts = urlsplit(self.path)
         try:
-            self._send(HTTPStatus.OK, self.answer(parts.path, dict(parse_qsl(parts.query))))
+            self._send(HTTPStatus.OK, answer())
         except LookupError as error:
             self._send(HTTPStatus.NOT_FOUND, {"error": f"there is no {error}"})
         except (ConfigError, ValueError, OSError) as error:

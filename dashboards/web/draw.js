@@ -59,6 +59,7 @@ function draw() {
   if (show.sensed && sensed) drawSensed();
   drawRobot(data.learner);
   if (show.planes) drawSpace();
+  onDraw();
   if (step >= data.steps) drawEnd(size);
   report();
 }

@@ -6,12 +6,6 @@ let number = 0;      // of the next episode
 let policy = null;   // updates of the policy that is playing
 let timer = 0;       // of the next episode
 
-async function request(path) {
-  const answer = await fetch(path, {cache: "no-cache"}), content = await answer.json();
-  if (!answer.ok) throw new Error(content.error);
-  return content;
-}
-
 async function playNext() {
   clearTimeout(timer);
   try {
@@ -22,7 +16,7 @@ async function playNext() {
     setPlaying(true);
     await showStatus();
   } catch (error) {
-    message.textContent = error instanceof TypeError ? "The server does not answer." : error.message;
+    message.textContent = reason(error);
     timer = setTimeout(playNext, 1000 * RETRY_S);
   }
 }

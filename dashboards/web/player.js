@@ -13,7 +13,8 @@ let step = 0;        // step that is shown; fractional while playing
 let playing = false;
 let lastTime = 0;    // time of the last frame played, ms
 let nextFrame = 0;
-let onEnd = () => {};  // called when playing reaches the last step
+let onEnd = () => {};   // called when playing reaches the last step
+let onDraw = () => {};  // called when the scene is drawn
 const theme = {};
 
 // Positions in metres from their packed form: int16 differences from step to step, low bytes before high bytes. Sums
@@ -85,7 +86,7 @@ function selectRobot(robot) {
 function readTheme() {
   const style = getComputedStyle(document.documentElement);
   for (const name of ["scene", "arena", "edge", "halo", "sensing", "mark", "text", "muted", "success", "line",
-                      "state-1", "state-2", "state-3"]) {
+                      "state-1", "state-2", "state-3", "other-1", "other-2", "other-3"]) {
     theme[name] = style.getPropertyValue("--" + name).trim();
   }
 }

@@ -134,8 +134,10 @@ class Watch:
     """File to write; `episode-SEED` in the run's artifacts by default."""
     live: Switch = 0
     """Serve a page on 127.0.0.1 that follows a running training and plays the newest checkpoint's policy."""
+    drive: Switch = 0
+    """Serve a page on which you drive 25 scenes, beside policy, rules and FL-ORCA; with --format: that of --seed."""
     port: int = 8400
-    """--live: port of the page; 0 takes a free one."""
+    """--live, --drive: port of the page; 0 takes a free one."""
     checkpoint: str = "newest"
     """The policy's checkpoint: newest, best (by the evaluations during training), or a name (step-…)."""
     runs_dir: Path = Path("runs")
@@ -148,6 +150,11 @@ class Watch:
         require(
             not self.live or (self.format == "html" and self.out is None),
             "--live plays in a web page and writes no file; leave out --format and --out",
+        )
+        require(not (self.live and self.drive), "--live and --drive serve a page each; leave one of them out")
+        require(
+            not self.drive or self.format != "html" or self.out is None,
+            "--drive serves a page and writes no file; leave out --out, or name a --format for what was driven",
         )
 
 

@@ -37,7 +37,8 @@ def server(values: dict[str, int]) -> Iterator[PageServer]:
         "/broken.json": broken,
         "/missing.json": missing,
     }
-    made = PageServer(answers, 0)
+    changes = {"/set.json": lambda sent: values.update(sent) or values}
+    made = PageServer(answers, 0, changes)
     thread = threading.Thread(target=made.serve)
     thread.start()
     yield made
@@ -85,6 +86,32 @@ def test_unchanged_answers_are_not_sent_again(server: PageServer, values: dict[s
 def test_refusals_state_the_reason(server: PageServer, path: str, status: int, reason: str):
     found = get(server, path)
     assert (found[0], json.loads(found[2])) == (status, {"error": reason})
+
+
+def post(server: PageServer, path: str, body: str, **headers: str) -> tuple[int, object]:
+    port = int(server.url.rsplit(":", 1)[1].strip("/"))
+    connection = http.client.HTTPConnection(HOST, port, timeout=20)
+    named = {"Content-Type": "application/json"} | {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request("POST", path, body, named)
+    answer = connection.getresponse()
+    found = answer.status, json.loads(answer.read())
+    connection.close()
+    return found
+
+
+def test_a_change_is_made_by_a_post_of_json_alone(server: PageServer, values: dict[str, int]):
+    assert post(server, "/set.json", '{"n": 5}') == (200, {"n": 5}) and values == {"n": 5}
+    assert get(server, "/set.json?n=6")[0] == 404
+    assert post(server, "/data.json", "{}")[0] == 404
+    for body, headers in (
+        ('{"n": 7}', {"Content_Type": "text/plain"}),  # what a foreign page may send
+        ('{"n": 7}', {"Host": "example.org:80"}),
+        ("[7]", {}),
+        ("{", {}),
+        (json.dumps({"n": "7" * 5000}), {}),
+    ):
+        assert post(server, "/set.json", body, **headers)[0] in (403, 409), (body[:20], headers)
+    assert values == {"n": 5}
 
 
 def test_another_hosts_name_is_refused(server: PageServer):
