@@ -8,7 +8,7 @@ from typing import NamedTuple
 from dashboards.analysis.aggregate import CELLS_PER_METHOD, Results
 from dashboards.analysis.claim_checks import Claim, Verdict, with_verdict
 from dashboards.analysis.claim_text import NOTE, contradictions, table_of, tally, verdict_table
-from dashboards.analysis.comparison import BASELINES_NOTE, comparison_rows
+from dashboards.analysis.comparison import BASELINES_NOTE, comparison_rows, rule_rows
 from dashboards.analysis.methods import in_order
 from dashboards.figures.diagrams import DIAGRAMS
 from dashboards.figures.example_episodes import EXAMPLES
@@ -103,7 +103,7 @@ def _preset_section(section: PresetSection) -> list[str]:
     ]
     if section.baselines:
         lines += ["### Learned policies beside rules that learn nothing", "", BASELINES_NOTE, ""]
-        lines += [*comparison({"learned": section.results} | section.baselines), ""]
+        lines += [*table_of(*rule_rows(section.results, section.baselines)), ""]
     lines += ["### Figures", ""]
     for picture in PICTURES:
         lines += [f"![{picture.alt}, preset {section.name}]({section.folder}{picture.file})", ""]

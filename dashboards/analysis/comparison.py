@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from actors.evaluation.result_table import LEARNED, ResultRow
-from dashboards.analysis.aggregate import SETUPS, Results, Setup, success
+from dashboards.analysis.aggregate import SETUPS, Measurement, Results, Setup, difference, success
 from dashboards.analysis.methods import in_order, method_label
 
 BASELINES_NOTE = (
     "`fl-orca` drives the learning robot as the rest of the swarm, with more knowledge than the method's state holds; "
-    "`greedy` heads for where the state shows the own group. Means over setups, from the same start scenes."
+    "`greedy` heads for where the state shows the own group, `field` adds M_IN's potential field to it. Means over "
+    "setups, from the same start scenes. The best rule is that of each setup, by these very episodes. A policy is not "
+    "below it where the 95 % interval of their difference reaches 0."
 )
 
 
@@ -62,7 +64,45 @@ def _comparison_row(rivals: list[Results], method: str) -> list[str]:
     return [method_label(method), str(len(shared)), *means, *map(str, wins)]
 
 
+def rule_rows(learned: Results, rules: dict[str, Results]) -> tuple[list[str], list[list[str]]]:
+    """A table of Fixed success of learned policies beside rules, one row per method.
+
+    Args:
+      learned: results of the policies.
+      rules: results of the rules by name; a method need not have all of them.
+
+    Returns:
+      The header, and the rows, over the setups that the policies and the method's rules all have.
+    """
+    header = ["method", "setups", "learned", *rules, "best rule", "learned, lowest", "not below the best rule in"]
+    return header, [_rule_row(learned, rules, method) for method in in_order(learned.methods())]
+
+
+def _rule_row(learned: Results, rules: dict[str, Results], method: str) -> list[str]:
+    own = {name: rule for name, rule in rules.items() if any(rule.fixed(method, setup) for setup in SETUPS)}
+    rivals = [learned, *own.values()]
+    shared = [setup for setup in SETUPS if all(results.fixed(method, setup) is not None for results in rivals)]
+    if not own or not shared:
+        return [method_label(method), "0", *["–"] * (len(rules) + 4)]
+    measured = {name: [_measured(rules[name], method, setup) for setup in shared] for name in own}
+    policies = [_measured(learned, method, setup) for setup in shared]
+    best = [max(column, key=lambda found: found.estimate.value) for column in zip(*measured.values(), strict=True)]
+    differences = [difference(policy, rule) for policy, rule in zip(policies, best, strict=True)]
+    count = sum(found is not None and found.estimate.high >= 0 for found in differences)
+    lowest = 100 * min(found.estimate.value for found in policies)
+    cells = [_mean(measured[name]) if name in own else "–" for name in rules]
+    return [method_label(method), str(len(shared)), _mean(policies), *cells, _mean(best), f"{lowest:.1f} %", str(count)]
+
+
+def _mean(found: Sequence[Measurement]) -> str:
+    return f"{100 * sum(each.estimate.value for each in found) / len(found):.1f} %"
+
+
 def _success(results: Results, method: str, setup: Setup) -> float:
+    return _measured(results, method, setup).estimate.value
+
+
+def _measured(results: Results, method: str, setup: Setup) -> Measurement:
     cell = results.fixed(method, setup)
     assert cell is not None
-    return success(cell).estimate.value
+    return success(cell)

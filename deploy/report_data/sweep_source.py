@@ -10,7 +10,7 @@ from actors.evaluation.result_table import ResultRow, read_table
 from dashboards.analysis.aggregate import CELLS_PER_METHOD, Results
 from dashboards.analysis.claim_text import tally
 from dashboards.analysis.claims import judge
-from dashboards.analysis.comparison import BASELINES_NOTE, baselines_of, comparison_rows, results_of
+from dashboards.analysis.comparison import BASELINES_NOTE, baselines_of, comparison_rows, results_of, rule_rows
 from dashboards.pages.report_page import ReportContents, TableSection
 from dashboards.plotly_charts.chart import Chart, Table
 from dashboards.plotly_charts.result_charts import failure_causes, heatmaps, transfers
@@ -123,19 +123,18 @@ def _comparisons(rows: list[ResultRow], presets: dict[str, Results]) -> list[Tab
     """Presets side by side, and baselines beside the learned policies."""
     sections = []
     if len(presets) > 1:
-        table = _comparison_table(presets)
+        table = _table_of(*comparison_rows(presets))
         sections.append(TableSection("presets", "Presets side by side", "Mean Fixed success.", table))
     for name, results in presets.items():
         baselines = baselines_of([row for row in rows if row.preset == name])
         if baselines:
             title = f"Learned policies beside rules that learn nothing, preset {name}"
-            table = _comparison_table({"learned": results, **baselines})
+            table = _table_of(*rule_rows(results, baselines))
             sections.append(TableSection(f"rivals-{len(sections)}", title, BASELINES_NOTE, table))
     return sections
 
 
-def _comparison_table(rivals: dict[str, Results]) -> Table:
-    header, rows = comparison_rows(rivals)
+def _table_of(header: list[str], rows: list[list[str]]) -> Table:
     return Table(tuple(header), [tuple(row) for row in rows])
 
 

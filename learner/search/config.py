@@ -74,6 +74,7 @@ class SearchConfig:
         require(self.hours is None or self.hours > 0, f"budget must be more than 0 hours, not {self.budget!r}")
         require(0 <= self.sampler_seed < 2**31, f"sampler_seed must be in 0..{2**31 - 1}, not {self.sampler_seed}")
         require(len(self.objective) > 0, "objective must name at least one")
+        require(len(self.seeds) > 0, "seeds must have at least one value")
         require(len(set(self.labels)) == len(self.labels), f"objective must name each once, not {self.labels}")
         require(not self.prune or self.policy == LEARNED, f"prune ends trainings, and {self.policy} is not trained")
         check_values(self.dimensions, self.set)

@@ -40,7 +40,7 @@ class SweepConfig:
     groups: tuple[int, ...] = GROUPS
     """Group counts."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Training seeds; all cells of a seed are trained before those of the next."""
+    """Training seeds; all cells of a seed are trained before those of the next. Without any, baselines alone play."""
     env_steps: int | None = None
     """Env steps of each training, the preset's by default; schedules are stretched to them."""
     episodes: int = 3_000
@@ -49,9 +49,9 @@ class SweepConfig:
     """Extrapolation: every policy in every other setup that it fits (M_IN, M_OUT: equal group count), or none."""
     extrapolation_episodes: int = 300
     """Extrapolation: greedy episodes in each other setup; as many as Fixed where Figures 3.4 to 3.6 draw it."""
-    baselines: tuple[BaselineName, ...] = ("fl-orca", "greedy")
-    """Rules that do not learn (see `shoal evaluate`), evaluated in every setup like the policies; may be empty."""
-    baseline_episodes: int = 500
+    baselines: tuple[BaselineName, ...] = ("fl-orca", "greedy", "field")
+    """Rules that do not learn (see `shoal evaluate`), in every setup of the methods that have them; may be empty."""
+    baseline_episodes: int = 3_000
     """Episodes of each baseline in each setup."""
     first_seed: int = 2_000_000_000
     """Seed of the first evaluated episode, later ones add 1 each. Calibration uses other seeds than evaluation."""
@@ -60,9 +60,10 @@ class SweepConfig:
         check_fields(self)
         for name in ("methods", "robots", "groups", "seeds", "baselines"):
             values = getattr(self, name)
-            some = isinstance(values, tuple) and (len(values) > 0 or name == "baselines")
+            some = isinstance(values, tuple) and (len(values) > 0 or name in ("seeds", "baselines"))
             require(some, f"{name} must have at least one value")
             require(len(set(values)) == len(values), f"{name} must not repeat a value, as in {values}")
+        require(bool(self.seeds or self.baselines), "seeds or baselines must have at least one value")
         rules = get_args(BaselineName)
         require(
             all(value in rules for value in self.baselines),

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from actors.evaluation.result_table import ResultRow
 from dashboards.analysis.aggregate import Results, Setup
 from dashboards.analysis.claims import judge
-from dashboards.analysis.comparison import baselines_of, presets_of
+from dashboards.analysis.comparison import baselines_of, presets_of, rule_rows
 from dashboards.figures.result_figures import PICTURES
 from dashboards.report import DRAWINGS, PresetSection, comparison, report_markdown
 from tests.dashboards.tables import claimed_table, fixed, row
@@ -73,6 +73,26 @@ def test_baselines_are_shown_beside_the_learned_policies_of_the_same_setups():
         row("sensor", Setup(25, 8), success=5)._replace(policy="greedy"),
     ]
     page = report_markdown(["r.csv"], [section("thesis", [*learned, *greedy])])
-    assert "| method | setups in all | learned | greedy | learned best in | greedy best in |" in page
-    assert "| M_sensor | 1 | 90.0 % | 95.0 % | 0 | 1 |" in page
+    assert "| method | setups | learned | greedy | best rule | learned, lowest | not below the best rule in |" in page
+    assert "| M_sensor | 1 | 90.0 % | 95.0 % | 95.0 % | 90.0 % | 0 |" in page
     assert "rules that learn nothing" not in report_markdown(["r.csv"], [section("thesis", learned)])
+
+
+def test_the_best_rule_is_that_of_each_setup_and_a_method_need_not_have_all_rules():
+    setups = (Setup(5, 1), Setup(10, 2), Setup(25, 8))
+
+    def rows_of(method, *shares):
+        return [row(method, setup, success=share) for setup, share in zip(setups, shares, strict=True)]
+
+    learned = Results([*rows_of("in", 99, 90, 80), *rows_of("sensor", 90, 90, 92.5)])
+    rules = {
+        "field": Results(rows_of("in", 90, 92, 99)),
+        "greedy": Results([*rows_of("in", 98, 20, 10), *rows_of("sensor", 80, 80, 93)]),
+    }
+    header, rows = rule_rows(learned, rules)
+    assert header[2:5] == ["learned", "field", "greedy"]
+    assert rows == [
+        ["M_sensor", "3", "90.8 %", "–", "84.3 %", "84.3 %", "90.0 %", "3"],
+        ["M_IN", "3", "89.7 %", "93.7 %", "42.7 %", "96.3 %", "80.0 %", "1"],
+        ["M_OUT", "0", "–", "–", "–", "–", "–", "–"],
+    ]

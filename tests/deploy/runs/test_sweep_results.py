@@ -15,7 +15,9 @@ from deploy.runs.sweep_results import SweepResults
 from learner.sweep.grid import SweepConfig, cell_hash, make_cells
 from sim_core.checks import ConfigError
 
-GRID = SweepConfig(methods=("sensor", "out"), robots=(5, 10), groups=(1,), seeds=(1,), baselines=("greedy",))
+GRID = SweepConfig(
+    methods=("sensor", "out"), robots=(5, 10), groups=(1,), seeds=(1,), baselines=("greedy",), baseline_episodes=500
+)
 
 
 def row_of(grid: SweepConfig, episodes: int = 3000) -> ResultRow:

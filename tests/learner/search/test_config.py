@@ -56,6 +56,7 @@ def test_a_budget_is_in_trials_or_hours(budget, trials, hours):
         ({"budget": "many"}, "budget must be trials or hours"),
         ({"budget": "0h"}, "more than 0 hours"),
         ({"objective": ()}, "objective must name at least one"),
+        ({"seeds": (), "policy": "greedy"}, "seeds must have at least one"),
         ({"objective": ("success", "success")}, "name each once"),
         ({"objective": ("one/mine.py:f", "two/mine.py:f")}, "name each once"),
         ({"space": ("n_step=1..5",), "set": ("n_step=3",)}, "both name n_step"),

@@ -205,11 +205,23 @@ def test_results_of_more_episodes_are_accepted():
     assert done_cells(SMALL, [cell], rows) == {cell.key: rows}
 
 
+def test_without_seeds_the_baselines_alone_play():
+    sweep = SweepConfig(seeds=(), robots=(5,), groups=(1, 2))
+    played = [(cell.policy, cell.config.world.method) for cell in make_cells(sweep)]
+    assert sorted(set(played)) == [
+        ("field", "in"),
+        *(("fl-orca", method) for method in ("in", "out", "sensor")),
+        *(("greedy", method) for method in ("in", "out", "sensor")),
+    ]
+    assert len(played) == 14 and all(cell.config.final_eval_episodes == 3_000 for cell in make_cells(sweep))
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
         ({"robots": ()}, "robots must have at least one"),
         ({"seeds": (1, 1)}, "seeds must not repeat"),
+        ({"seeds": (), "baselines": ()}, "seeds or baselines must have at least one"),
         ({"methods": ("sensor", "north")}, "method must be one of: sensor, in, out"),
         ({"episodes": 0}, "episodes must be at least 1"),
         ({"extrapolation_episodes": 0}, "extrapolation_episodes must be at least 1"),
