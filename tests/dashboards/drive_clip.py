@@ -23,8 +23,9 @@ from deploy.runs.policy_lookup import find_policy
 from learner.run_folder import RunFolder
 from tests.dashboards.chromium import open_chromium, wait_until
 
-SIZE_PX = (1100, 900)
+SCREEN = {"width": 980, "height": 800, "deviceScaleFactor": 1, "mobile": False}
 STEPS_PER_FRAME = 2
+SHEET_FRAMES = 20
 HAND = """
 const mean = axis => {
   const mates = [...Array(numRobots).keys()].filter(r => r !== data.learner && groupOf(r) === learnerGroup);
@@ -63,6 +64,8 @@ def frames(browser: Any) -> Iterator[NDArray[np.uint8]]:
     for at in range(0, steps + 1, 4 * STEPS_PER_FRAME):
         browser.execute_script("seek(arguments[0])", at)
         yield picture(browser)
+    browser.execute_script("seek(data.steps); window.scrollTo(0, document.body.scrollHeight)")
+    yield from [picture(browser)] * SHEET_FRAMES
 
 
 def send(browser: Any, kind: str, key: str) -> None:
@@ -72,7 +75,7 @@ def send(browser: Any, kind: str, key: str) -> None:
 
 def picture(browser: Any) -> NDArray[np.uint8]:
     """What the browser shows `[height, width, 3]`."""
-    return np.asarray(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB").resize(SIZE_PX))
+    return np.asarray(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB"))
 
 
 def main() -> None:
@@ -85,10 +88,13 @@ def main() -> None:
     run = RunFolder(arguments.run)
     config = run.config()
     with tempfile.TemporaryDirectory() as folder, open_chromium(Path(folder) / "chromium") as browser:
-        server = drive_server(RunFolder(Path(folder)), config.world, find_policy(run, config), arguments.seed, 0)
+        scratch = RunFolder(Path(folder) / run.path.name)
+        server = drive_server(scratch, config.world, find_policy(run, config), arguments.seed, 0)
         thread = threading.Thread(target=server.serve)
         thread.start()
         try:
+            browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", SCREEN)
+            browser.execute_cdp_cmd("Emulation.setScrollbarsHidden", {"hidden": True})
             browser.get(server.url)
             wait_until(browser, "driving && data !== null")
             browser.execute_script("element('speed').value = '0.25'")
