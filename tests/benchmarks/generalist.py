@@ -27,6 +27,7 @@ from deploy.cli import main as shoal
 from deploy.runs.policy_lookup import find_policy
 from learner.presets import preset_config
 from learner.run_folder import RunFolder
+from learner.tracking.journal import read_rows
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig
 from sim_core.outcomes import ENDED, OUTCOME_NAMES, Outcome
@@ -155,6 +156,19 @@ def table(method: str, rows: list[Row], seen: int, options: argparse.Namespace) 
     return found
 
 
+def wandering(method: str, options: argparse.Namespace) -> str:
+    """A sentence on how much each training's policy still changes: its evaluations in the last half."""
+    found = []
+    for seed in options.seeds:
+        folder = RunFolder(options.runs_dir / f"{method}-{seed}")
+        half = folder.config().total_env_steps / 2
+        rates = [row.metrics.get("eval/success_rate") for row in read_rows(folder.journal) if row.env_steps >= half]
+        found.append(np.std([rate for rate in rates if rate is not None], ddof=1))
+    return "evaluations in the last half of a training, standard deviation in points: " + ", ".join(
+        f"{100 * deviation:.2f}" for deviation in found
+    )
+
+
 def write(path: Path, played: list[Played]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
@@ -176,6 +190,7 @@ def main() -> int:
         rows = [compared(players) for players in by_setup]
         seen = len(preset_config("generalist", method).env.worlds)
         Console(width=140).print(table(method, rows, seen, options))
+        print(wandering(method, options))
     return 0
 
 
