@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from matplotlib.patches import Circle, Ellipse, Wedge
 from numpy.typing import NDArray
 
 from dashboards.analysis.aggregate import Setup
+from dashboards.figures.state_machine import diagram_2_2
 from dashboards.figures.style import GRID, MUTED, TEXT, new_figure
 from sim_core.config import WorldConfig
 from sim_core.methods.apf import field_of, field_params
@@ -296,6 +298,13 @@ class Diagram(NamedTuple):
 
 
 DIAGRAMS = (
+    Diagram(
+        "diagram-2-2.png",
+        "Figure 2.2: FL-ORCA's state machine, and how long and often its robots are in its states",
+        "sensor",
+        DRAWN_SETUP,
+        partial(diagram_2_2, seed=EPISODE_SEED),
+    ),
     Diagram("diagram-3-1.png", "Figure 3.1: what M_sensor's robot perceives", "sensor", DRAWN_SETUP, diagram_3_1),
     Diagram("diagram-4-1.png", "Figures 4.1 and 4.2: the groups as ellipses", "out", DRAWN_SETUP, diagram_4_1),
     Diagram("diagram-4-3.png", "Figure 4.3: the velocity of M_OUT as a sum of two", "out", DRAWN_SETUP, diagram_4_3),
