@@ -36,8 +36,9 @@ def sense(method: str, robot: Any, groups: Any, goals: Any, held: int) -> dict[s
 
     `held` is the action of the last decision, -1 to decide.
     """
-    positions = (groups - robot)[None].astype(np.float32)  # [1, groups, robots, 2]
-    mask = np.ones(positions.shape[:3], bool)  # False for a robot that is not sensed
+    positions = (groups - robot)[None].astype(np.float32)  # [1, groups, robots, 2]; NaN: not sensed
+    mask = np.isfinite(positions).all(axis=-1)
+    positions = np.nan_to_num(positions)
     if method != "sensor":
         inputs = {"positions": positions, "mask": mask, "goals": (goals - robot)[None].astype(np.float32)}
         return inputs | ({"held": np.array([held])} if method == "out" else {})
@@ -72,4 +73,5 @@ def main(folder: Path, seconds: float = 12.0, walk_m_s: float = 0.5) -> None:
     print(f"{1e6 * spent_s / (tick + 1):.0f} us a tick")
 
 
-main(Path(sys.argv[1]))
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
