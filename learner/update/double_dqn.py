@@ -89,7 +89,7 @@ def mean_loss(
     return mean, (fixed - chosen).detach()
 
 
-def margin_losses(q_tm1: Tensor, teacher: Tensor, margin: float) -> Tensor:
+def margin_losses(q_tm1: Tensor, teacher: Tensor, margin: float) -> tuple[Tensor, Tensor]:
     """max_a [q(a) + margin (a != teacher)] - q(teacher), `[batch]`: 0 once the teacher's action leads by the margin.
 
     Hester et al. (2018), Deep Q-learning from Demonstrations, Eq. 5.
@@ -98,16 +98,15 @@ def margin_losses(q_tm1: Tensor, teacher: Tensor, margin: float) -> Tensor:
       q_tm1: action values `[batch, actions]`.
       teacher: actions of the teacher `[batch]`.
       margin: by how much their values shall exceed the others'.
+
+    Returns:
+      (losses, the actions of the maxima `[batch]`: the lowest index among equals).
     """
-    rival = rivals(q_tm1, teacher, margin)
-    best, taught = (q_tm1.gather(1, action.unsqueeze(1)).squeeze(1) for action in (rival, teacher))
-    return best - taught + margin * (rival != teacher)
-
-
-def rivals(q_tm1: Tensor, teacher: Tensor, margin: float) -> Tensor:
-    """argmax_a [q(a) + margin (a != teacher)], `[batch]`; the lowest index among equals."""
     raised = q_tm1.detach() + margin
-    return raised.scatter(1, teacher.unsqueeze(1), raised.gather(1, teacher.unsqueeze(1)) - margin).argmax(dim=1)
+    own = teacher.unsqueeze(1)
+    rival = raised.scatter(1, own, raised.gather(1, own) - margin).argmax(dim=1)
+    best, taught = (q_tm1.gather(1, action.unsqueeze(1)).squeeze(1) for action in (rival, teacher))
+    return best - taught + margin * (rival != teacher), rival
 
 
 def importance_weights(probability: NDArray[np.float64], batch_size: int, exponent: float) -> NDArray[np.float32]:

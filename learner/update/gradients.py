@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from actors.policy.network import DuelingNetwork, Network, fold_dueling_head
-from learner.update.double_dqn import Batch, LossName, margin_losses, mean_loss, rivals, td_targets
+from learner.update.double_dqn import Batch, LossName, margin_losses, mean_loss, td_targets
 
 Layer = tuple[Tensor, Tensor]
 """Weight `[fan_out, fan_in]` and bias `[fan_out]` of a layer, or their gradients."""
@@ -76,8 +76,8 @@ class FlatNetwork:
         return FlatNetwork(copy.deepcopy(self.network))
 
 
-class AutogradGradients:
-    """Gradients by autograd, for any network.
+class _Gradients:
+    """What both kinds of gradients work on.
 
     Args:
       online, target: the networks.
@@ -95,6 +95,10 @@ class AutogradGradients:
         self._loss = loss
         self._margin = margin
 
+
+class AutogradGradients(_Gradients):
+    """Gradients by autograd, for any network."""
+
     def __call__(self, batch: Batch) -> MinibatchStats:
         """Writes the loss's gradient to the online network's `values.grad`."""
         with torch.no_grad():
@@ -104,28 +108,20 @@ class AutogradGradients:
         q_tm1 = self._online.network(batch.s_tm1)
         loss, td_errors = mean_loss(q_tm1, batch.a_tm1, target, self._loss, batch.weight)
         if batch.teacher is not None and batch.teacher_weight is not None:
-            loss = loss + (batch.teacher_weight * margin_losses(q_tm1, batch.teacher, self._margin)).mean()
+            taught, _ = margin_losses(q_tm1, batch.teacher, self._margin)
+            loss = loss + (batch.teacher_weight * taught).mean()
         assert self._online.values.grad is not None
         self._online.values.grad.zero_()
         loss.backward()  # type: ignore[no-untyped-call]
         return MinibatchStats(loss.detach(), q_tm1.detach().mean(), td_errors.abs().mean(), td_errors)
 
 
-class HandWrittenGradients:
-    """Backpropagation through a multilayer perceptron with ReLU, written out (arguments as of AutogradGradients).
+class HandWrittenGradients(_Gradients):
+    """Backpropagation through a multilayer perceptron with ReLU, written out.
 
     The head of a dueling network is a linear map of its streams, so such a network is a perceptron, too: the head is
     folded into one layer for the forward pass, and that layer's gradients are unfolded in the backward pass.
     """
-
-    def __init__(
-        self, online: FlatNetwork, target: FlatNetwork, double: bool, loss: LossName, margin: float = 0.0
-    ) -> None:
-        self._online = online
-        self._target = target
-        self._double = double
-        self._loss = loss
-        self._margin = margin
 
     @torch.no_grad()
     def __call__(self, batch: Batch) -> MinibatchStats:
@@ -144,9 +140,10 @@ class HandWrittenGradients:
             losses, grad = batch.weight * losses, batch.weight * grad
         delta = torch.zeros_like(q_tm1).scatter_(1, action, grad.div(-size).unsqueeze(1))
         if batch.teacher is not None and batch.teacher_weight is not None:
-            losses = losses + batch.teacher_weight * margin_losses(q_tm1, batch.teacher, self._margin)
+            taught, rival = margin_losses(q_tm1, batch.teacher, self._margin)
+            losses = losses + batch.teacher_weight * taught
             share = batch.teacher_weight.div(size).unsqueeze(1)
-            delta.scatter_add_(1, rivals(q_tm1, batch.teacher, self._margin).unsqueeze(1), share)
+            delta.scatter_add_(1, rival.unsqueeze(1), share)
             delta.scatter_add_(1, batch.teacher.unsqueeze(1), -share)
         self._backward(layers, [layer[:size] for layer in activations[:-1]], delta)
         return MinibatchStats(losses.mean(), q_tm1.mean(), td_errors.abs().mean(), td_errors)

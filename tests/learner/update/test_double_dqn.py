@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from learner.update.double_dqn import importance_weights, margin_losses, mean_loss, minibatch, rivals, td_targets
+from learner.update.double_dqn import importance_weights, margin_losses, mean_loss, minibatch, td_targets
 
 # Row 0: both networks prefer action 1. Row 1: online prefers 0, target 2 - there the algorithms differ.
 ONLINE = torch.tensor([[1.0, 3.0, 2.0], [5.0, 4.0, 1.0]])
@@ -90,15 +90,15 @@ def test_the_margin_loss_by_hand():
     """The teacher's action leads by more than the margin, by less, is behind, and ties with the margin."""
     q = torch.tensor([[1.0, 0.5, 0.0], [1.0, 0.75, 0.0], [0.0, 0.25, 2.0], [1.0, 0.5, 1.0]])
     teacher = torch.tensor([0, 0, 1, 0])
-    assert margin_losses(q, teacher, 0.5).tolist() == [0.0, 0.25, 2.25, 0.5]
-    assert rivals(q, teacher, 0.5).tolist() == [0, 1, 2, 2]
+    losses, rivals = margin_losses(q, teacher, 0.5)
+    assert losses.tolist() == [0.0, 0.25, 2.25, 0.5] and rivals.tolist() == [0, 1, 2, 2]
 
 
 def test_the_margin_loss_equals_a_loop_and_so_does_its_gradient():
     rng = np.random.default_rng(0)
     q = torch.tensor(rng.normal(size=(50, 7)), requires_grad=True)
     teacher = torch.from_numpy(rng.integers(7, size=50))
-    losses = margin_losses(q, teacher, 0.4)
+    losses, _ = margin_losses(q, teacher, 0.4)
     losses.sum().backward()
     for row in range(50):
         values = q[row].detach().numpy()
