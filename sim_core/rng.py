@@ -19,26 +19,12 @@ _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
 _SHIFT_30, _SHIFT_27, _SHIFT_31, _SHIFT_11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
 _TO_UNIT = 1.0 / 9007199254740992.0
-_SHIFT_32, _LOW_32, _TO_UNIT_32 = np.uint64(32), np.uint64(0xFFFFFFFF), 2.0**-32
-_CENTRAL = 0.47575
-_A = (
-    -39.69683028665376,
-    220.9460984245205,
-    -275.9285104469687,
-    138.357751867269,
-    -30.66479806614716,
-    2.506628277459239,
-)
-_B = (-54.47609879822406, 161.5858368580409, -155.6989798598866, 66.80131188771972, -13.28068155288572)
-_C = (
-    0.007784894002430293,
-    0.3223964580411365,
-    2.400758277161838,
-    2.549732539343734,
-    -4.374664141464968,
-    -2.938163982698783,
-)
-_D = (0.007784695709041462, 0.3224671290700398, 2.445134137142996, 3.754408661907416)
+_SHIFT_32, _LOW_32 = np.uint64(32), np.uint64(0xFFFFFFFF)
+_ONE, _TWO, _HALF, _QUARTER, _TO_UNIT_32 = map(np.float32, (1.0, 2.0, 0.5, 0.25, 2.0**-32))
+_LN_2, _THIRD, _FIFTH, _SEVENTH = map(np.float32, (math.log(2.0), 1 / 3, 1 / 5, 1 / 7))
+_SQRT_HALF_BITS, _MANTISSA_BITS = np.int32(0x3F3504F3), np.int32(23)
+_SINE = [(-1.0) ** k * (2.0 * math.pi) ** (2 * k + 1) / math.factorial(2 * k + 1) for k in range(6)]
+_S0, _S1, _S2, _S3, _S4, _S5 = map(np.float32, _SINE)
 
 
 @kernel
@@ -57,49 +43,40 @@ def uniform_at(state, draw):
 
 
 @inlined
-def _central_quantile(q):
-    """The standard normal quantile of 1/2 + q in the middle of the distribution, where |q| <= _CENTRAL."""
-    r = q * q
-    a = ((((_A[0] * r + _A[1]) * r + _A[2]) * r + _A[3]) * r + _A[4]) * r + _A[5]
-    b = ((((_B[0] * r + _B[1]) * r + _B[2]) * r + _B[3]) * r + _B[4]) * r + 1.0
-    return q * a / b
+def _log(u):
+    """Ln u of a float32 in (0, 1]: u = m 2^e with m in [sqrt(1/2), sqrt(2)), and ln m = 2 artanh((m - 1) / (m + 1))."""
+    bits = np.float32(u).view(np.int32)
+    e = np.int32(np.int32(bits - _SQRT_HALF_BITS) >> _MANTISSA_BITS)
+    m = np.int32(bits - np.int32(e << _MANTISSA_BITS)).view(np.float32)
+    s = (m - _ONE) / (m + _ONE)
+    z = s * s
+    return np.float32(e) * _LN_2 + _TWO * s * (_ONE + z * (_THIRD + z * (_FIFTH + z * _SEVENTH)))
 
 
 @inlined
-def _tail_quantile(q):
-    """The standard normal quantile of 1/2 + q in the tails."""
-    r = math.sqrt(-2.0 * math.log(0.5 - abs(q)))
-    c = ((((_C[0] * r + _C[1]) * r + _C[2]) * r + _C[3]) * r + _C[4]) * r + _C[5]
-    d = (((_D[0] * r + _D[1]) * r + _D[2]) * r + _D[3]) * r + 1.0
-    return math.copysign(c / d, q)
-
-
-@inlined
-def _halves(bits):
-    """The two halves of a draw as numbers in (-1/2, 1/2)."""
-    high, low = np.int64(bits >> _SHIFT_32), np.int64(bits & _LOW_32)
-    return (high + 0.5) * _TO_UNIT_32 - 0.5, (low + 0.5) * _TO_UNIT_32 - 0.5
+def _sine(turns):
+    """The sine of a float32 number of turns in [-1/4, 1/4], by its series."""
+    z = turns * turns
+    return turns * (_S0 + z * (_S1 + z * (_S2 + z * (_S3 + z * (_S4 + z * _S5)))))
 
 
 @inlined
 def add_normal(state, draw, stride, scale, out_x, out_y):
-    """Adds normal noise of standard deviation `scale` to points (out_x, out_y) `[count]`.
+    """Adds normal noise of standard deviation `scale` to points (out_x, out_y) `[count]`, all of them float32.
 
-    Point i takes draw `draw` + `stride` i after `state`: x the quantile of its high 32 bits, y that of its low ones.
-    Quantiles are P. J. Acklam's rational approximation, whose relative error is below 1.2e-9. The middle of the
-    distribution is a loop without a branch, which compilers turn into vector code; the tails have a loop of their own.
+    Point i takes draw `draw` + `stride` i after `state`: its high 32 bits, as a float32 in (0, 1], give the radius, its
+    low ones, as a signed number of turns, the direction (Box and Muller 1958). So the largest radius is 6.7. Logarithm
+    and sine are series of plain operations: the loop has no branch and no call, compilers turn it into vector code, and
+    every machine computes the same numbers.
     """
     for i in range(out_x.shape[0]):
-        x, y = _halves(bits_at(state, draw + stride * i))
-        noise_x, noise_y = scale * _central_quantile(x), scale * _central_quantile(y)
-        out_x[i] += noise_x if abs(x) <= _CENTRAL else 0.0
-        out_y[i] += noise_y if abs(y) <= _CENTRAL else 0.0
-    for i in range(out_x.shape[0]):
-        x, y = _halves(bits_at(state, draw + stride * i))
-        if abs(x) > _CENTRAL:
-            out_x[i] += scale * _tail_quantile(x)
-        if abs(y) > _CENTRAL:
-            out_y[i] += scale * _tail_quantile(y)
+        bits = bits_at(state, draw + stride * i)
+        u = (np.float32(np.uint32(bits >> _SHIFT_32)) + _HALF) * _TO_UNIT_32
+        turns = np.float32(np.int32(np.uint32(bits & _LOW_32))) * _TO_UNIT_32
+        radius = scale * np.float32(math.sqrt(-_TWO * _log(u)))
+        ahead = _QUARTER - abs(turns)
+        out_x[i] += radius * _sine(ahead)
+        out_y[i] += radius * _sine(math.copysign(_QUARTER - abs(ahead), turns))
 
 
 @kernel

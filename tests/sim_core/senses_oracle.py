@@ -4,7 +4,6 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
 
 from sim_core.config import WorldConfig
 from sim_core.worlds import WorldBatch
@@ -23,6 +22,14 @@ def bits(stream: int, draw: int) -> int:
 
 def uniform(stream: int, draw: int) -> float:
     return (bits(stream, draw) >> 11) / 2.0**53
+
+
+def normal_pair(stream: int, draw: int) -> np.ndarray:
+    """Two normal numbers of one draw (Box and Muller 1958); the radius is that of a float32."""
+    word = bits(stream, draw)
+    u = float((np.float32(word >> 32) + np.float32(0.5)) * np.float32(2.0**-32))
+    turn = float(np.uint32(word & 0xFFFFFFFF).astype(np.int32)) / 2.0**32
+    return math.sqrt(-2 * math.log(u)) * np.array([math.cos(2 * math.pi * turn), math.sin(2 * math.pi * turn)])
 
 
 class Oracle:
@@ -87,9 +94,7 @@ class Oracle:
         return alone or i in self.dropped or bool(share and self.in_burst[i])
 
     def _noise(self, i: int) -> np.ndarray:
-        word = bits(self.stream, self.draw + 5 * i + 3)
-        quantiles = norm.ppf([(half + 0.5) / 2.0**32 for half in (word >> 32, word & 0xFFFFFFFF)])
-        return self.real("position_noise_m", 0) * quantiles
+        return self.real("position_noise_m", 0) * normal_pair(self.stream, self.draw + 5 * i + 3)
 
     def _mix_up(self, seen: np.ndarray) -> None:
         for i in range(self.n):

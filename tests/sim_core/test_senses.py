@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import kstest, norm
 
 from sim_core.config import WorldConfig
 from sim_core.jit import kernel
@@ -13,7 +14,7 @@ from sim_core.methods.headings import heading_velocities
 from sim_core.outcomes import Outcome
 from sim_core.rng import add_normal
 from sim_core.worlds import Pilot, WorldBatch
-from tests.sim_core.senses_oracle import Oracle, bits, norm
+from tests.sim_core.senses_oracle import Oracle, normal_pair
 
 WORLD = {"robots": 5, "groups": 3, "arena_radius_m": 1.5, "robot_radius_m": 0.06, "orca_radius_m": 0.18}
 SENSES = {
@@ -153,15 +154,27 @@ def test_noise_has_its_variance_and_no_bias_and_is_independent():
 
 @kernel
 def _normal(stream, x, y):
-    add_normal(stream, 3, 5, 1.0, x, y)
+    add_normal(stream, 3, 5, np.float32(1), x, y)
 
 
-def test_normal_numbers_are_quantiles_of_the_draws():
-    x, y = np.zeros((2, 50_000))
+def test_normal_numbers_are_those_of_box_and_muller():
+    x, y = np.zeros((2, 50_000), np.float32)
     _normal(np.uint64(2**63 + 5), x, y)
-    words = np.array([bits(2**63 + 5, 3 + 5 * i) for i in range(len(x))], np.uint64)
-    for found, half in ((x, words >> np.uint64(32)), (y, words & np.uint64(0xFFFFFFFF))):
-        np.testing.assert_allclose(found, norm.ppf((half + 0.5) / 2.0**32), rtol=2e-9)
+    expected = np.array([normal_pair(2**63 + 5, 3 + 5 * i) for i in range(len(x))])
+    np.testing.assert_allclose(np.stack([x, y], axis=1), expected, atol=2e-6)
+
+
+def test_normal_numbers_are_normal_and_independent():
+    x, y = np.zeros((2, 1_000_000), np.float32)
+    _normal(np.uint64(77), x, y)
+    for found in (x, y):
+        assert kstest(found, norm.cdf).pvalue > 0.001
+        for beyond in (2.0, 3.0, 4.0):  # the tails, which the test before hardly sees
+            expected = 2 * norm.sf(beyond)
+            assert abs((np.abs(found) > beyond).mean() - expected) < 4 * math.sqrt(expected / len(found))
+    for power in (1, 2):
+        assert abs(np.corrcoef(x**power, y**power)[0, 1]) < 4 / math.sqrt(len(x))
+        assert abs(np.corrcoef(x[1:] ** power, x[:-1] ** power)[0, 1]) < 4 / math.sqrt(len(x))
 
 
 def test_positions_and_velocities_are_exactly_as_late_as_they_should_be():
