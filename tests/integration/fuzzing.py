@@ -67,6 +67,9 @@ class NoTracker:
     def resume(self, run_id: str) -> None:
         pass
 
+    def is_finished(self, run_id: str) -> bool:
+        return False
+
     def set_views(self) -> None:
         pass
 
