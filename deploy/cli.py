@@ -17,7 +17,7 @@ import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args
+from typing import Annotated, Any, NoReturn, cast, get_args
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # before numpy is imported: with more, processes compete for cores
@@ -139,11 +139,9 @@ def parse(arguments: Sequence[str]) -> Command:
       SystemExit: help was asked for (0), or a flag is unknown or malformed (2, after a message).
     """
     arguments, job = _split_job(arguments)
-    train = _train_defaults(arguments) if arguments and arguments[0] == "train" else Train()
-    subcommands = [
-        tyro.conf.subcommand(name, default=train) if options is Train else tyro.conf.subcommand(name)
-        for options, name in COMMANDS.items()
-    ]
+    subcommands = [tyro.conf.subcommand(name) for name in COMMANDS.values()]
+    if arguments[:1] == ["train"]:  # only then: making a config loads its method with all kernels
+        subcommands[0] = tyro.conf.subcommand("train", default=_train_defaults(arguments))
     union: Any = functools.reduce(operator.or_, map(_annotated, COMMANDS, subcommands))
     command: Command = tyro.cli(
         union,
@@ -193,7 +191,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of `shoal`; returns the exit code."""
     prepare_streams()
     try:
-        return execute(parse(sys.argv[1:] if arguments is None else arguments))
+        words = list(sys.argv[1:] if arguments is None else arguments)
+        command = parse(words)
+        if isinstance(command, Train) and command.supervise:
+            _supervise(command, words)
+        return execute(command)
     except ConfigError as error:
         print(f"shoal: {' '.join(str(error).splitlines())}", file=sys.stderr)  # names may hold line breaks
         return BAD_INPUT
@@ -212,6 +214,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"shoal: {sentence}", file=sys.stderr)
         return code
+
+
+def _supervise(command: Train, words: list[str]) -> NoReturn:
+    """Makes this process the supervisor of the run that `words` start."""
+    from deploy.runs.folders import stamped_name
+    from deploy.supervisor import take_over
+
+    name = command.launch.name or stamped_name(command.run)
+    named = [] if command.launch.name else ["--name", name]
+    take_over(command.launch.runs_dir / name, [word for word in words if word != "--supervise"] + named)
 
 
 def _explained(error: Exception) -> tuple[str | None, int]:

@@ -19,7 +19,7 @@ from actors.evaluation.recording import Recording
 from actors.evaluation.trajectory import Episode, load_episodes, save_episodes
 from actors.policy.baselines import METHOD_RULES, Baseline, exists
 from actors.policy.policy import WeightsSnapshot
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from dashboards.pages.assets import SERVED
 from dashboards.pages.player import player_data, player_page
 from dashboards.pages.server import PageServer, Query, episode_number

@@ -4,41 +4,25 @@ from __future__ import annotations
 
 import shlex
 import signal
+from collections.abc import Callable
 from functools import partial
 
-from actors.rollout.env_guard import env_guard
-from actors.rollout.vector_env import env_shape
 from deploy.console.summary_tables import evaluation_table, setups_table, summary_lines
 from deploy.console.terminal import plain_console
 from deploy.console.training_display import make_display
-from deploy.runs.artifacts import artifact_steps
+from deploy.runs.checks import check_device, check_environment
 from learner.checkpoints.checkpoint import Checkpoint, finished_names
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig, check_files_unchanged
-from learner.run import RunResult, RunSession, resume_point
+from learner.run import RunResult, RunSession, Step, resume_point
 from learner.run_end import SHOWN, RunEnd
 from learner.run_folder import RunFolder
+from learner.tracking.journal import Row
 from learner.tracking.local_store import find_store
 from learner.tracking.mlflow_run import Tracker
 from learner.tracking.redaction import full_uri, public_uri
+from learner.training.cluster import Cluster
 from learner.training.stop_signals import Interrupted
-from learner.update.learner import learning_device
-
-
-def check_device(config: RunConfig, address: str | None) -> None:
-    """Raises ConfigError if this machine lacks the config's device; a cluster's is checked once Ray has joined it."""
-    if config.engine == "process" or address is None:
-        learning_device(config.device)
-
-
-def check_environment(folder: RunFolder, config: RunConfig, deadline_s: float) -> None:
-    """Rehearses the run's environment, so that nothing starts if it does what it must not.
-
-    Raises:
-      ConfigError: see `env_shape`; a user's own traceback is kept in the run's folder.
-    """
-    with folder.traceback_kept(), env_guard(deadline_s):
-        env_shape(config.env)
 
 
 def open_tracker(folder: RunFolder) -> Tracker:
@@ -99,15 +83,23 @@ def resume_training(folder: RunFolder, config: RunConfig, tracker: Tracker, opti
 
 
 def run_training(
-    folder: RunFolder, config: RunConfig, tracker: Tracker, checkpoint: Checkpoint | None, options: ClusterOptions
+    folder: RunFolder,
+    config: RunConfig,
+    tracker: Tracker,
+    checkpoint: Checkpoint | None,
+    options: ClusterOptions,
+    opened: Cluster | None = None,
 ) -> int:
-    """Trains to the end or to a signal; returns the exit code, 128 + the signal's number after one."""
+    """Trains to the end or to a signal; returns the exit code, 128 + the signal's number after one.
+
+    Where `opened` is given, the components have been started already.
+    """
     console = plain_console()
     console.print(f"run {folder.path}", soft_wrap=True)
     try:
         with make_display(console, config.total_env_steps) as display:
-            steps = partial(artifact_steps, folder, config, tracker, display.message)
-            result = RunSession(folder, config, tracker, display, options).execute(checkpoint, steps)
+            steps = partial(_artifact_steps, folder, config, tracker, display.message)
+            result = RunSession(folder, config, tracker, display, options, opened).execute(checkpoint, steps)
     except Interrupted as interrupted:
         return _stopped(folder, interrupted.signal, "")
     if result.evaluation is None:
@@ -115,6 +107,19 @@ def run_training(
         return _stopped(folder, result.stopped_by or 0, f" at {result.env_steps:,} env steps; {saved}")
     _show(folder, config, tracker, result)
     return 0
+
+
+def _artifact_steps(
+    folder: RunFolder,
+    config: RunConfig,
+    tracker: Tracker,
+    message: Callable[[str], None],
+    result: RunResult,
+    rows: list[Row],
+) -> list[Step]:
+    from deploy.runs.artifacts import artifact_steps  # at the end, since it imports matplotlib
+
+    return artifact_steps(folder, config, tracker, message, result, rows)
 
 
 def _stopped(folder: RunFolder, number: int, where: str) -> int:

@@ -14,8 +14,8 @@ from typing import Any, Literal
 
 from actors.evaluation.result_table import GROUPS, ROBOTS
 from actors.policy.baselines import METHOD_RULES
+from actors.rollout.env_spec import EnvSpec
 from actors.rollout.exploration import Exploration, linear_schedule
-from actors.rollout.vector_env import EnvSpec
 from sim_core import ENV_ID
 from sim_core.checks import ConfigError, check_fields, require
 from sim_core.config import WorldConfig

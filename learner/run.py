@@ -8,28 +8,28 @@ starts from the newest checkpoint. Once all env steps are done, a session only m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import AbstractContextManager, closing, nullcontext
 from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
 
 from actors.evaluation.evaluator import evaluate_in_parallel
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.env_guard import env_guard
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from actors.rollout.worker import select_stats
 from actors.service.fault_policy import STEADY_CALLS, CallFailed, ComponentFailed, FaultTracker, RunFailed, first_line
 from actors.service.messages import EpisodeStats
-from actors.service.rpc import Calls, LocalCalls
+from actors.service.rpc import Calls
 from actors.storage.full_disk import DISK_TIMEOUT_S, is_disk_full, is_full
 from actors.storage.uri import Location, join_location
 from learner.checkpoints.checkpoint import Checkpoint, check_config, check_state, newest_valid
 from learner.checkpoints.manifest import CheckpointError, UnusableCheckpointError
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig
+from learner.engine import open_calls, open_cluster
 from learner.file_names import CONFIG
 from learner.loop import TrainingLoop
-from learner.ray_backend.cluster import RayCluster, task_calls
 from learner.ray_backend.metrics import RayMetrics
 from learner.run_end import EndState, RunEnd, discard_end, final_seeds
 from learner.run_folder import RunFolder
@@ -39,7 +39,7 @@ from learner.tracking.journal import Journal, PushedMark, Row
 from learner.tracking.mlflow_run import MLFLOW_ERRORS, Tracker
 from learner.tracking.observer import Display, MirroringObserver
 from learner.tracking.redaction import hide_secrets
-from learner.training.cluster import Cluster, ProcessCluster
+from learner.training.cluster import Cluster
 from learner.training.evaluation_summary import Evaluation, as_metrics, score, summarise
 from learner.training.recovery import RunLost
 from learner.training.stop_signals import STOPPING, StopRequest, stop_on_signals
@@ -93,16 +93,24 @@ class RunSession:
       tracker: its MLflow run, started or resumed.
       display: shows progress to the user.
       options: the Ray cluster that holds the run's components, and its deadlines.
+      opened: the components of the first attempt, where they have been started already.
     """
 
     def __init__(
-        self, folder: RunFolder, config: RunConfig, tracker: Tracker, display: Display, options: ClusterOptions
+        self,
+        folder: RunFolder,
+        config: RunConfig,
+        tracker: Tracker,
+        display: Display,
+        options: ClusterOptions,
+        opened: Cluster | None = None,
     ) -> None:
         self._folder = folder
         self._config = config
         self._tracker = tracker
         self._display = display
         self._options = options
+        self._opened = opened
         self._fault_log = FaultLog(folder.faults, display.message)
         self._fault_tracker = FaultTracker(1 if config.env.is_swarm else STEADY_CALLS)
 
@@ -168,7 +176,7 @@ class RunSession:
         """
         offset = checkpoint.state["journal_offset"] if checkpoint else 0
         with closing(self._journal(offset)) as journal:
-            cluster = open_cluster(self._config, incarnation, self._options)
+            cluster, self._opened = self._opened or open_cluster(self._config, incarnation, self._options), None
             stop.listen(STOPPING)  # Ray has set a handler of its own
             with closing(self._delivery(journal, offset)) as delivery:
                 delivery.deliver_up_to(offset)
@@ -345,23 +353,6 @@ def evaluation_by_setup(config: RunConfig, episodes: EpisodeStats) -> dict[str, 
         return {}
     chunks = [select_stats(episodes, slice(i * size, (i + 1) * size)) for i in range(len(setups))]
     return {world.setup: summarise(chunk) for world, chunk in zip(setups, chunks, strict=True)}
-
-
-def open_cluster(config: RunConfig, incarnation: int, options: ClusterOptions) -> Cluster:
-    """Starts the run's components under its engine."""
-    if config.engine == "process":
-        return ProcessCluster(config, incarnation)
-    return RayCluster(config, incarnation, options)
-
-
-@contextmanager
-def open_calls(config: RunConfig, options: ClusterOptions) -> Iterator[tuple[Calls, int]]:
-    """Calls for tasks alone, without the run's components, under its engine; and how many to make at once."""
-    if config.engine == "process":
-        yield LocalCalls(), 1
-    else:
-        with task_calls(options.address) as calls:
-            yield calls
 
 
 def resume_point(folder: RunFolder, config: RunConfig) -> tuple[Checkpoint, list[str]]:

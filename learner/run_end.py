@@ -16,11 +16,11 @@ from typing import NamedTuple
 
 from actors.evaluation.evaluation_store import find_evaluation, stored_or_played
 from actors.policy.policy import WeightsSnapshot
-from actors.rollout.vector_env import EnvSpec, env_shape
+from actors.rollout.env_spec import EnvSpec
+from actors.rollout.vector_env import env_shape
 from actors.rollout.worker import join_stats
 from actors.service.messages import EpisodeStats
 from learner.config import RunConfig
-from learner.export.policy_file import read_saved_policy, save_policy
 from learner.file_names import END_STATE, POLICY
 from learner.run_folder import write_json
 
@@ -72,6 +72,8 @@ class RunEnd:
     @classmethod
     def begin(cls, folder: Path, config: RunConfig, state: EndState, weights: WeightsSnapshot) -> RunEnd:
         """Stores what the end works from; from then on no env step is made again."""
+        from learner.export.policy_file import save_policy  # here, since it imports torch
+
         discard_end(folder)
         folder.mkdir()
         save_policy(folder / POLICY, weights, config, env_shape(config.env))
@@ -86,6 +88,8 @@ class RunEnd:
             state = EndState(**json.loads((folder / END_STATE).read_text()))
             if state.env_steps < config.total_env_steps:
                 return None
+            from learner.export.policy_file import read_saved_policy  # here, since it imports torch
+
             return cls(folder, config, state, read_saved_policy(folder / POLICY, config, env_shape(config.env)))
         except (OSError, ValueError, TypeError):
             return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from sim_core.jit import kernel
 from sim_core.methods import make_method
 from sim_core.outcomes import Outcome
 from sim_core.packed import packed
+from sim_core.pilot import Pilot
 from sim_core.rng import world_streams
 from sim_core.scenes import make_scene
 from sim_core.senses import Senses
@@ -38,15 +38,6 @@ def _end_step(running: Any, outcome: Any, step_reward: Any, reward: Any) -> Any:
             running[world] = outcome[world] == _RUNNING
             any_running |= running[world]
     return any_running
-
-
-class Pilot(enum.Enum):
-    """FL-ORCA in the learning robot's place, for which it knows its goal and its neighbours' velocities."""
-
-    FREE = enum.auto()
-    """It moves with FL-ORCA's velocity."""
-    SNAPPED = enum.auto()
-    """It takes the action whose velocity is nearest to FL-ORCA's."""
 
 
 class Command(NamedTuple):

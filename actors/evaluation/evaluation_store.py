@@ -14,7 +14,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from actors.service.messages import EpisodeStats
 from actors.storage.atomic_write import replacing_folder
 from actors.storage.zarr_columns import load_rows, open_store, save_rows

@@ -18,9 +18,10 @@ from actors.evaluation.recording import Recording
 from actors.evaluation.trajectory import Episode
 from actors.policy.baselines import ActionRule, Baseline, make_baseline
 from actors.policy.policy import Policy, WeightsSnapshot
+from actors.rollout.env_spec import EnvSpec
 from actors.rollout.foreign_env import EnvError, ForeignVectorEnv
 from actors.rollout.foreign_spaces import shown
-from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
+from actors.rollout.vector_env import make_vector_env, reset_seeded
 from actors.rollout.worker import join_stats, select_stats
 from actors.service.fault_policy import Action, CallFailed, ComponentKind, decide
 from actors.service.messages import NO_OUTCOME, EpisodeStats
@@ -28,7 +29,8 @@ from actors.service.rpc import Calls, Ref, by_reference
 from sim_core.checks import require
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
-from sim_core.worlds import Pilot, WorldBatch, is_done
+from sim_core.pilot import Pilot
+from sim_core.worlds import WorldBatch, is_done
 
 MAX_ENVS = 250
 """Most environments stepped together."""

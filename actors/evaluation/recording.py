@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from actors.evaluation.trajectory import BY_HAND, NO_ACTION, Episode
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
-from sim_core.worlds import Command, Decision, Pilot, WorldBatch
+from sim_core.pilot import Pilot
+from sim_core.worlds import Command, Decision, WorldBatch
 
 
 class Recording:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sim_core.checks import require
 from sim_core.config import WorldConfig
-from sim_core.worlds import Pilot
+from sim_core.pilot import Pilot
 
 
 class ActionRule(Protocol):

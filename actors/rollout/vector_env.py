@@ -9,47 +9,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.rollout.env_spec import EnvSpec
 from actors.rollout.foreign_env import ForeignVectorEnv, rehearse_env
 from actors.rollout.joined_env import JoinedVectorEnv
 from sim_core import ENV_ID
-from sim_core.config import WorldConfig
 from sim_core.envs import SwarmVectorEnv
 from sim_core.worlds import rehearse
-
-
-class EnvSpec(NamedTuple):
-    """Specification of an environment: its Gymnasium id, and the world's settings if it is the swarm environment.
-
-    `shares` are the worlds of several setups with their shares of the environments; empty where `world` is alone.
-    """
-
-    env_id: str
-    world: WorldConfig
-    shares: tuple[tuple[WorldConfig, float], ...] = ()
-
-    @property
-    def worlds(self) -> list[WorldConfig]:
-        """The worlds of all setups."""
-        return [world for world, _ in self.shares] or [self.world]
-
-    @property
-    def row_size(self) -> int:
-        """Elements of a row, where an observation is rows of groups; else 0."""
-        return self.world.method_class.row_size * self.world.history if self.is_swarm else 0
-
-    def of_setup(self, world: WorldConfig) -> EnvSpec:
-        """The environment of one setup alone."""
-        return EnvSpec(self.env_id, world)
-
-    @property
-    def is_swarm(self) -> bool:
-        """Whether this is the project's own swarm environment."""
-        return self.env_id == ENV_ID
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Keyword arguments for Gymnasium's `make` and `make_vec`."""
-        return dataclasses.asdict(self.world) if self.is_swarm else {}
 
 
 def make_vector_env(spec: EnvSpec, num_envs: int) -> gym.vector.VectorEnv[Any, Any, Any]:

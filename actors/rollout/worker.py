@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.policy.policy import Policy, WeightsSnapshot
+from actors.rollout.env_spec import EnvSpec
 from actors.rollout.exploration import draw_random_actions, explore
 from actors.rollout.joined_env import JoinedVectorEnv
 from actors.rollout.nstep import NStepAssembler, Steps, empty_steps
-from actors.rollout.vector_env import EnvSpec, final_observations, make_vector_env, reset_seeded, spaces_of
+from actors.rollout.vector_env import final_observations, make_vector_env, reset_seeded, spaces_of
 from actors.service.messages import (
     NO_OUTCOME,
     SCHEMA_VERSION,

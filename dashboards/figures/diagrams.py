@@ -30,8 +30,9 @@ from sim_core.methods.ellipse import ellipse_params, group_ellipse, left_out_of
 from sim_core.methods.headings import heading_velocities
 from sim_core.methods.m_sensor import sector_edges
 from sim_core.outcomes import Outcome
+from sim_core.pilot import Pilot
 from sim_core.render import GROUP_COLOURS
-from sim_core.worlds import Pilot, WorldBatch
+from sim_core.worlds import WorldBatch
 
 DRAWN_SETUP = Setup(10, 3)
 """Robots per group, and groups, of the drawn worlds."""

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from actors.evaluation.evaluator import evaluate, record_episode
 from actors.evaluation.trajectory import Episode
 from actors.policy.baselines import Baseline
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from dashboards.analysis.aggregate import Setup
 from dashboards.figures.diagrams import Diagram
 from dashboards.figures.film_strip import episode_strip

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from dashboards.figures.style import GRID, MUTED, TEXT, new_figure
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
+from sim_core.pilot import Pilot
 from sim_core.swarm.flock_rules import FOLLOWER, SINGLE_GROUP, STATE_NAMES, TURN_RIGHT, VISION_FREE
-from sim_core.worlds import Pilot, WorldBatch
+from sim_core.worlds import WorldBatch
 
 STATES = range(len(STATE_NAMES))
 PLACES = {SINGLE_GROUP: (0.0, 1.0), VISION_FREE: (1.0, 1.0), FOLLOWER: (0.0, 0.0), TURN_RIGHT: (1.0, 0.0)}

@@ -22,12 +22,12 @@ START_S = 180.0
 PORTS = range(20_000, 32_768)
 """Above the ports of Ray's workers, below those of outgoing connections: a server that restarts finds its port free."""
 TITLES = {
-    "rollout worker": "ray::RolloutNode",
-    "replay shard": "ray::ShardNode",
-    "learner": "ray::LearnerActor",
-    "evaluation": "ray::evaluate",
+    "rollout worker": ("ray::RolloutNode", "ray::SpareWorker.collect"),
+    "replay shard": ("ray::ShardNode", "ray::SpareShard.add", "ray::SpareShard.sample"),
+    "learner": ("ray::LearnerActor",),
+    "evaluation": ("ray::evaluate",),
 }
-"""Ray's process title of each kind of component."""
+"""How Ray's process titles of each kind of component begin; those of a spare that has taken a place, too."""
 
 
 def free_port() -> int:

@@ -13,7 +13,7 @@ from actors.evaluation.evaluation_store import StoredEvaluation, refuse_existing
 from actors.evaluation.evaluator import record_episode
 from actors.evaluation.trajectory import save_episodes
 from actors.policy.baselines import Baseline
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from actors.rollout.worker import join_stats
 from actors.service.messages import EpisodeStats
 from deploy.console.summary_tables import compared, evaluation_table, setups_table

@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-import datetime
+from contextlib import ExitStack
 
 from actors.policy.baselines import Baseline
 from deploy.console.terminal import plain_console
 from deploy.options.training import Launch, Train
+from deploy.runs.checks import check_device, check_environment
 from deploy.runs.folders import (
     check_outlasts_job,
     check_plain_name,
-    default_name,
     make_folder,
     new_storage,
     run_location,
-)
-from deploy.training import (
-    check_device,
-    check_environment,
-    finished_at,
-    open_tracker,
-    resume_training,
-    run_training,
+    stamped_name,
 )
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig, config_hash
+from learner.engine import closed_if_refused, open_early
 from learner.run_folder import RunFolder, RunIdentity
-from learner.tracking.mlflow_run import Tracker
 from learner.tracking.redaction import public_uri
 from learner.training.memory_estimate import check_fits
 from sim_core.checks import require
@@ -57,20 +50,25 @@ def run(command: Train) -> int:
         check_fits(config)
     check_device(config, launch.ray_address())
     storage = new_storage(command.checkpoint_url, folder.path.name, command.keep_best)
-    tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
-    with folder.lock():
-        _check_free(folder, not folder.has_begun())  # another process may have begun it meanwhile
-        tracker.start(config)
+    opened = open_early(config, launch.cluster_options(), "deploy.training")
+    from deploy.training import run_training  # not before, since it imports MLflow
+    from learner.tracking.mlflow_run import Tracker
+
+    with ExitStack() as stack:
+        with closed_if_refused(opened):
+            tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
+            stack.enter_context(folder.lock())
+            _check_free(folder, not folder.has_begun())  # another process may have begun it meanwhile
+            tracker.start(config)
         folder.save_storage(storage)
         folder.save_config(config)
         folder.save_identity(RunIdentity(config.name, public_uri(tracker.uri), launch.experiment, tracker.run_id))
-        return run_training(folder, config, tracker, None, launch.cluster_options())
+        return run_training(folder, config, tracker, None, launch.cluster_options(), opened)
 
 
 def _run_folder(config: RunConfig, launch: Launch, or_resume: bool) -> RunFolder:
     """The run's folder; raises ConfigError if it exists and must not."""
-    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    folder = RunFolder(launch.runs_dir / (launch.name or f"{default_name(config)}-{stamp}"))
+    folder = RunFolder(launch.runs_dir / (launch.name or stamped_name(config)))
     _check_free(folder, or_resume)
     return folder
 
@@ -95,6 +93,8 @@ def _check_storage(folder: RunFolder, checkpoint_url: str | None) -> None:
 
 def _resume(folder: RunFolder, config: RunConfig, options: ClusterOptions) -> int:
     """Resumes an unfinished run; returns the exit code."""
+    from deploy.training import finished_at, open_tracker, resume_training  # here, since it imports MLflow
+
     require(
         config_hash(folder.config()) == config_hash(config),
         f"{folder.path} holds a run of other settings; choose another --name",

@@ -91,6 +91,8 @@ class Train:
     """Named settings of --method in place of the defaults: those of `shoal sweep`, or of one policy for all setups."""
     or_resume: bool = False
     """Resume the run of this --name if it exists; it must have the same settings. Needs --name."""
+    supervise: Switch = 0
+    """Go on by itself when the driver is killed: a small process watches it, and resumes the run."""
     run: RunConfig = field(default_factory=RunConfig)
     """What to learn."""
     launch: Launch = field(default_factory=Launch)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from actors.evaluation.conditions import Condition, world_under
 from actors.evaluation.evaluator import Candidate
 from actors.policy.baselines import Baseline, check_exists
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from deploy.options.results import Players
 from deploy.runs.policy_lookup import find_policy
 from learner.presets import preset_config

@@ -17,7 +17,7 @@ from actors.evaluation.conditions import Axis, Condition, along, world_under
 from actors.evaluation.evaluation_store import StoredEvaluation, load_evaluation, save_evaluation
 from actors.evaluation.statistics import Estimate, rate
 from actors.policy.policy import WeightsSnapshot
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from actors.service.messages import EpisodeStats
 from actors.storage.atomic_write import replacing_file
 from dashboards.figures.stress_curves import Panel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import fcntl
 import os
 import re
@@ -25,6 +26,11 @@ JOB = "RAY_JOB_CONFIG_JSON_ENV_VAR"
 def default_name(config: RunConfig) -> str:
     """How names of runs with `config` begin, unless the user gives one."""
     return re.sub(r"[^\w.+=-]+", "-", config.name.replace("×", ""))
+
+
+def stamped_name(config: RunConfig) -> str:
+    """The name of a new run with `config` that the user has not named."""
+    return f"{default_name(config)}-{datetime.datetime.now().strftime('%Y%m%d-%H%M%S')}"
 
 
 def default_sweep_name(grid: SweepConfig) -> str:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from actors.evaluation.evaluator import Candidate, make_action_rule
 from actors.policy.policy import Policy, WeightsSnapshot
-from actors.rollout.vector_env import EnvSpec, make_vector_env, reset_seeded
+from actors.rollout.env_spec import EnvSpec
+from actors.rollout.vector_env import make_vector_env, reset_seeded
 from learner.export.robot_module import NO_DECISION, RobotModule, robot_class
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig

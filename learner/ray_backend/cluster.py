@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,8 +21,9 @@ from ray.exceptions import AuthenticationError
 
 from actors.evaluation.evaluator import Candidate, evaluate_in_parallel
 from actors.replay.node import ShardNode
+from actors.rollout.env_spec import EnvSpec
 from actors.rollout.node import RolloutNode
-from actors.rollout.vector_env import EnvShape, EnvSpec, env_shape
+from actors.rollout.vector_env import EnvShape, env_shape
 from actors.service.fault_policy import CallFailed, RunFailed
 from actors.service.messages import EpisodeStats
 from actors.service.rpc import Handle, LocalCalls, Ref, by_reference, local_handle
@@ -128,8 +130,10 @@ def connect(cpus: int, address: str | None, spare_cpus: int = 0) -> None:
     guard_ray(address is not None)
     os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # from calls of nodes that have been replaced
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    options: dict[str, Any] = {"address": address}
+    options: dict[str, Any] = {"address": address, "runtime_env": {"env_vars": ONE_THREAD}}
     if address is None:
+        for name, value in ONE_THREAD.items():  # a runtime_env would start processes anew that Ray has ready
+            os.environ.setdefault(name, value)
         options = {
             "address": "local",
             "include_dashboard": False,
@@ -141,8 +145,8 @@ def connect(cpus: int, address: str | None, spare_cpus: int = 0) -> None:
             options["_temp_dir"] = str(own)
             _own_folders.append(own)
     try:
-        with _kept_from_children(signal.SIGHUP):
-            ray.init(logging_level="ERROR", runtime_env={"env_vars": ONE_THREAD}, **options)
+        with _kept_from_children(signal.SIGHUP), _own_handler(signal.SIGTERM):
+            ray.init(logging_level="ERROR", **options)
     except (ConnectionError, AuthenticationError) as error:
         raise ConfigError(
             f"no Ray cluster answers at {address!r}; start one with `ray start --head`, "
@@ -169,6 +173,17 @@ def _kept_from_children(number: int) -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _own_handler(number: int) -> Iterator[None]:
+    """Restores the handler of a signal after the `with` block: Ray sets one that ends the process with other codes."""
+    before = signal.getsignal(number)
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(number, before)
 
 
 def leave() -> None:

@@ -7,7 +7,6 @@ and has rehearsed the work of its kind. It holds no part of the run until `begin
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import Any, Generic, TypeVar
 
 import ray
@@ -22,7 +21,19 @@ from actors.service.rpc import Calls, Handle
 N = TypeVar("N")
 
 
-class SpareWorker(RolloutNode):
+class Spare:
+    """What every spare can do."""
+
+    def is_ready(self) -> bool:
+        """True, once it can be asked."""
+        return True
+
+    def take_name(self, kind: type[Any]) -> None:
+        """Names this object's class as `kind` is named, which the title of its process then shows."""
+        self.__class__ = type(kind.__name__, (type(self),), {})
+
+
+class SpareWorker(Spare, RolloutNode):
     """A spare of the rollout workers.
 
     Args:
@@ -36,10 +47,6 @@ class SpareWorker(RolloutNode):
         rehearsal.set_weights(weights)
         rehearsal.collect(0.0)
 
-    def is_ready(self) -> bool:
-        """True, once it can be asked."""
-        return True
-
     def begin(
         self,
         worker_id: int,
@@ -49,22 +56,20 @@ class SpareWorker(RolloutNode):
         pushes_in_flight: int,
     ) -> None:
         """Becomes a rollout worker (see RolloutNode)."""
-        super().__init__(self._settings, worker_id, incarnation, calls, shards, pushes_in_flight)
+        RolloutNode.__init__(self, self._settings, worker_id, incarnation, calls, shards, pushes_in_flight)
+        self.take_name(RolloutNode)
 
 
-class SpareShard(ShardNode):
+class SpareShard(Spare, ShardNode):
     """A spare of the replay shards."""
 
     def __init__(self) -> None:
         """Loads nothing more than its modules; a shard's kernels are few."""
 
-    def is_ready(self) -> bool:
-        """True, once it can be asked."""
-        return True
-
     def begin(self, settings: ShardSettings) -> None:
         """Becomes an empty shard (see ShardNode)."""
-        super().__init__(settings)
+        ShardNode.__init__(self, settings)
+        self.take_name(ShardNode)
 
 
 class Spares(Generic[N]):
@@ -82,23 +87,38 @@ class Spares(Generic[N]):
 
     def keep(self) -> None:
         """Starts what is missing; where the cluster has no free CPU slot, Ray starts it once there is one."""
+        for pair in self._ready():
+            if not _is_alive(pair[1]):
+                self._waiting.remove(pair)
         while len(self._waiting) < self._count:
             spare: Any = self._start()
             self._waiting.append((spare, spare.is_ready.remote()))
 
     def take(self, *arguments: Any) -> Handle[N] | None:
         """A spare that has begun with `arguments`; None if there is none that is ready."""
-        ready, _ = ray.wait([ref for _, ref in self._waiting], timeout=0) if self._waiting else ([], [])
-        for spare, ref in [pair for pair in self._waiting if pair[1] in ready]:
-            self._waiting.remove((spare, ref))
-            with suppress(RayError):  # it has died meanwhile
-                ray.get(ref)
-                spare.begin.remote(*arguments)
-                handle: Handle[N] = spare
+        for pair in self._ready():
+            self._waiting.remove(pair)
+            if _is_alive(pair[1]):
+                pair[0].begin.remote(*arguments)
+                handle: Handle[N] = pair[0]
                 return handle
         return None
+
+    def _ready(self) -> list[tuple[Any, Any]]:
+        """Those whose start has ended, well or not."""
+        refs = [ref for _, ref in self._waiting]
+        ready = set(ray.wait(refs, num_returns=len(refs), timeout=0)[0]) if refs else set()
+        return [pair for pair in self._waiting if pair[1] in ready]
 
     def discard(self) -> None:
         """Kills them."""
         while self._waiting:
             ray.kill(self._waiting.pop()[0])
+
+
+def _is_alive(ready: Any) -> bool:
+    """Whether a spare has started, by its answer to `is_ready`."""
+    try:
+        return bool(ray.get(ready))
+    except RayError:
+        return False

@@ -11,17 +11,12 @@ import socket
 import sqlite3
 import subprocess
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import numpy as np
-import torch
-
-from actors.policy.network import load_snapshot
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import EnvShape
 from actors.service.fault_policy import first_line
@@ -31,7 +26,6 @@ from learner.tracking.journal import FINAL, Row, mlflow_metrics
 from learner.tracking.local_store import opening
 from learner.tracking.mlflow_views import TAG, packed_view, sweep_views
 from learner.tracking.redaction import VARIABLE, hide_secrets, public_uri
-from learner.update.networks import acting_network
 from sim_core.checks import ConfigError
 
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
@@ -39,15 +33,13 @@ os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "30")
 
 import mlflow  # noqa: E402
-import mlflow.pytorch  # noqa: E402
 from mlflow.entities import Experiment, LifecycleStage, Metric, Param, RunTag  # noqa: E402
 from mlflow.exceptions import MlflowException  # noqa: E402
-from mlflow.models import infer_signature  # noqa: E402
 from mlflow.protos.databricks_pb2 import RESOURCE_ALREADY_EXISTS, ErrorCode  # noqa: E402
 from requests import RequestException  # noqa: E402
 from sqlalchemy.exc import SQLAlchemyError  # noqa: E402
 
-from learner.tracking.mlflow_registry import POLICY_MODEL, UPDATES, dataset_inputs, find_policy, register_policy  # noqa: E402
+from learner.tracking.mlflow_registry import dataset_inputs, find_policy, register_policy  # noqa: E402
 
 MLFLOW_ERRORS = (MlflowException, SQLAlchemyError, RequestException)
 """What MLflow's client raises when its store fails."""
@@ -261,30 +253,12 @@ class Tracker:
           shape: shape of its environment.
           score: by which the registry ranks the policies of a setup.
         """
+        from learner.tracking.mlflow_policy import log_network  # here, since it imports torch
+
         with tracking_at(self.uri):
             logged = find_policy(self._client, self._experiment_id, self.run_id, weights.version)
-            uri = logged.model_uri if logged else self._log_network(weights, config, shape)
+            uri = logged.model_uri if logged else log_network(self.run_id, weights, config, shape)
             register_policy(self._client, config, self.run_id, weights.version, uri, score)
-
-    def _log_network(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> str:
-        """Logs the network; returns the model's URI."""
-        network = acting_network(config, shape)
-        load_snapshot(network, weights)
-        example = np.zeros((2, *shape.observation_space.shape), np.float32)
-        with torch.no_grad():
-            values = network(torch.from_numpy(example)).numpy()
-        with warnings.catch_warnings(), mlflow.start_run(run_id=self.run_id):
-            warnings.simplefilter("ignore")  # MLflow warns about its own schema inference
-            logged = mlflow.pytorch.log_model(
-                network.eval(),
-                name=POLICY_MODEL,
-                tags={UPDATES: str(weights.version)},
-                signature=infer_signature(example, values),
-                input_example=example,
-                serialization_format="pt2",
-                pip_requirements=[f"torch=={torch.__version__.split('+')[0]}", f"numpy=={np.__version__}"],
-            )
-        return str(logged.model_uri)
 
     def log_artifact(self, path: Path) -> None:
         """Uploads a file or a folder to the run's artifacts."""

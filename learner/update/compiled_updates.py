@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -31,8 +30,9 @@ from actors.policy.mlp_kernels import (
 )
 from actors.policy.network import PooledNetwork
 from learner.config import RunConfig
+from learner.update.adam import BETA1, BETA2, EPSILON, Adam
 from learner.update.gradients import FlatNetwork
-from learner.update.updates import UpdateStats
+from learner.update.stats import UpdateStats
 from sim_core.jit import inlined, kernel
 
 
@@ -114,9 +114,7 @@ class CompiledUpdates:
       config: of the run.
     """
 
-    def __init__(
-        self, online: FlatNetwork, target: FlatNetwork, optimiser: torch.optim.Adam, config: RunConfig
-    ) -> None:
+    def __init__(self, online: FlatNetwork, target: FlatNetwork, optimiser: Adam, config: RunConfig) -> None:
         self._online, self._target, self._optimiser = online, target, optimiser
         self._size = config.batch_size
         shared = 2 if isinstance(online.network, PooledNetwork) else 0
@@ -129,7 +127,6 @@ class CompiledUpdates:
             deltas = np.zeros_like(encoder.encoded), np.zeros_like(encoder.hidden)
             others = _arrays(target.layers[:shared]), _arrays(online.grads[:shared])
             self._pooling = _Pooling(layers, *others, encoder, *deltas)
-        group = optimiser.param_groups[0]
         self._hyper = _Hyperparameters(
             double=config.algorithm == "double_dqn",
             huber=config.loss == "huber",
@@ -137,9 +134,9 @@ class CompiledUpdates:
             max_norm=config.max_gradient_norm,
             target_interval=config.target_update_interval,
             target_rate=config.target_update_rate if config.target_update == "soft" else 0.0,
-            beta1=group["betas"][0],
-            beta2=group["betas"][1],
-            epsilon=group["eps"],
+            beta1=BETA1,
+            beta2=BETA2,
+            epsilon=EPSILON,
         )
         activations, other = (make_workspace(self._size, self._layers) for _ in range(2))
         td_target, grad, margin_grad = np.zeros((3, self._size), np.float32)
@@ -165,7 +162,7 @@ class CompiledUpdates:
 
     def __call__(self, columns: dict[str, Tensor], learning_rate: float, updates: int) -> tuple[UpdateStats, Floats]:
         """See `Updates`."""
-        state, count = self._state(), len(columns["action"])
+        state, count = self._optimiser.state, len(columns["action"])
         batch = _SuperBatch(
             s_tm1=columns["observation"].flatten(1).numpy(),
             a_tm1=columns["action"].numpy(),
@@ -185,15 +182,6 @@ class CompiledUpdates:
         made = count // self._size
         state["step"] += made
         return UpdateStats(*(sums / made).tolist()), td_errors
-
-    def _state(self) -> dict[str, Tensor]:
-        """Adam's state of the parameters, initialised as PyTorch does it."""
-        values = self._online.values
-        state: dict[str, Tensor] = self._optimiser.state[values]
-        if not state:
-            state["step"] = torch.zeros((), dtype=torch.float32)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(values.data), torch.zeros_like(values.data)
-        return state
 
 
 def _arrays(layers: list[tuple[Tensor, Tensor]]) -> Layers:

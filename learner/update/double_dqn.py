@@ -1,4 +1,4 @@
-"""The update as pure functions: TD targets, losses and importance weights.
+"""The update as pure functions: TD targets and losses.
 
 Algorithm 1 (DQN: Mnih et al. 2015) and Algorithm 2 (Double DQN: van Hasselt, Guez, Silver 2016) of the dissertation.
 """
@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -107,21 +105,3 @@ def margin_losses(q_tm1: Tensor, teacher: Tensor, margin: float) -> tuple[Tensor
     rival = raised.scatter(1, own, raised.gather(1, own) - margin).argmax(dim=1)
     best, taught = (q_tm1.gather(1, action.unsqueeze(1)).squeeze(1) for action in (rival, teacher))
     return best - taught + margin * (rival != teacher), rival
-
-
-def importance_weights(probability: NDArray[np.float64], batch_size: int, exponent: float) -> NDArray[np.float32]:
-    """(1 / (N P(i))) ** beta, divided by the greatest weight of the minibatch, so that updates are only scaled down.
-
-    Schaul et al. (2016), Section 3.4. N, the number of stored transitions, cancels.
-
-    Args:
-      probability: with which each transition was drawn, `[count]`, minibatch after minibatch.
-      batch_size: transitions of a minibatch; divides count.
-      exponent: beta.
-
-    Returns:
-      Weights `[count]` in (0, 1].
-    """
-    minibatches = probability.reshape(-1, batch_size)
-    weights: NDArray[np.float64] = (minibatches.min(axis=1, keepdims=True) / minibatches) ** exponent
-    return weights.ravel().astype(np.float32)

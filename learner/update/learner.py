@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors.torch import load_file
+from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from actors.policy.network import snapshot
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import EnvShape
 from learner.config import RunConfig
+from learner.update.adam import Adam
 from learner.update.compiled_updates import CompiledUpdates
 from learner.update.gradients import FlatNetwork
 from learner.update.networks import learning_network
-from learner.update.updates import TorchUpdates, Updates, UpdateStats
+from learner.update.stats import UpdateStats
+from learner.update.updates import TorchUpdates, Updates
 from sim_core.checks import require
 
 COLUMNS = ("reward", "discount", "action", "observation", "next_observation")
@@ -46,6 +52,7 @@ class Learner:
     """
 
     def __init__(self, config: RunConfig, shape: EnvShape) -> None:
+        torch.set_num_threads(1)
         with torch.random.fork_rng():
             torch.manual_seed(config.seed)
             online = learning_network(config, shape)
@@ -56,7 +63,7 @@ class Learner:
         self._average_updates = config.policy_average_updates
         self.online, self.target = self._online.network, self._target.network
         self.policy = self.online if self._average is None else self._average.network
-        self.optimiser = torch.optim.Adam([self._online.values], fused=True)
+        self.optimiser = Adam(self._online.values)
         by_hand = config.gradients == "by_hand"
         compilable = by_hand and config.network != "dueling" and self.device.type == "cpu"
         kind = CompiledUpdates if compilable else TorchUpdates
@@ -94,10 +101,25 @@ class Learner:
         state |= {f"target.{name}": tensor for name, tensor in self.target.state_dict().items()}
         if self._average is not None:
             state |= {f"average.{name}": tensor for name, tensor in self.policy.state_dict().items()}
-        for name, tensor in self.optimiser.state.get(self._online.values, {}).items():
-            state[f"optimiser.{name}"] = tensor
+        state |= {f"optimiser.{name}": tensor for name, tensor in self.optimiser.state.items()}
         state["updates"] = torch.tensor(self.updates)
         return {name: tensor.detach().cpu().clone().contiguous() for name, tensor in state.items()}
+
+    def state_writer(self) -> Callable[[Path], object]:
+        """Copies the state; returns a call that writes it to a file.
+
+        Raises:
+          FloatingPointError: a number is not finite; the message names it.
+        """
+        tensors = self.get_state()
+        for name, tensor in tensors.items():
+            if not torch.isfinite(tensor).all():
+                raise FloatingPointError(f"{name} is not finite")
+        return lambda path: path.write_bytes(to_bytes(tensors))
+
+    def read_state(self, path: Path) -> None:
+        """Restores what `state_writer` wrote (see `set_state` for errors)."""
+        self.set_state(load_file(str(path)))
 
     def set_state(self, state: dict[str, Tensor]) -> None:
         """Restores what `get_state` returned.
@@ -110,12 +132,9 @@ class Learner:
             self.target.load_state_dict(_with_prefix(state, "target."))
             if self._average is not None:
                 self.policy.load_state_dict(_with_prefix(state, "average."))
+            self.optimiser.set_state(_with_prefix(state, "optimiser."))
         except RuntimeError as error:
             raise ValueError(f"the saved networks have another shape: {str(error).splitlines()[-1].strip()}") from error
-        adam = _with_prefix(state, "optimiser.")
-        saved = {0: adam} if adam else {}
-        groups = self.optimiser.state_dict()["param_groups"]
-        self.optimiser.load_state_dict({"state": saved, "param_groups": groups})
         self.updates = int(state["updates"])
 
 

@@ -8,11 +8,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError
-from safetensors.torch import load_file
-from safetensors.torch import save as to_bytes
 
 from actors.policy.baselines import Baseline, MethodRule
 from actors.policy.policy import WeightsSnapshot
@@ -26,10 +23,9 @@ from actors.storage.fragment_writer import FragmentWriter, WriteResult, join_res
 from actors.storage.uri import Location, fetched, join_location
 from learner.config import RunConfig
 from learner.update.augmentation import RandomTurns
-from learner.update.double_dqn import importance_weights
-from learner.update.learner import Learner
+from learner.update.importance import importance_weights
 from learner.update.prefetch import NoPrefetch, Prefetch
-from learner.update.updates import UpdateStats
+from learner.update.stats import UpdateStats
 
 T = TypeVar("T")
 
@@ -84,7 +80,8 @@ class LearnerNode:
         calls: Calls,
         prefetch: bool = False,
     ) -> None:
-        torch.set_num_threads(1)
+        from learner.update.learner import Learner  # here, since the driver knows this class and needs no torch
+
         self._batch_size = config.batch_size
         self._learner = Learner(config, shape)
         self._shards = list(shards)
@@ -256,11 +253,11 @@ class LearnerNode:
           Diverged: a number of networks or optimiser is not finite; nothing is written.
         """
         self._await_priority_updates()
-        tensors = self._learner.get_state()
-        for name, tensor in tensors.items():
-            if not torch.isfinite(tensor).all():
-                raise self._diverged(f"{name} is not finite")
-        self._writer.start(join_location(location, WEIGHTS), lambda path: path.write_bytes(to_bytes(tensors)))
+        try:
+            write = self._learner.state_writer()
+        except FloatingPointError as error:
+            raise self._diverged(str(error)) from error
+        self._writer.start(join_location(location, WEIGHTS), write)
         refs = [
             self._calls.start(shard, ShardNode.save, _shard_folder(location, i)) for i, shard in enumerate(self._shards)
         ]
@@ -298,7 +295,7 @@ class LearnerNode:
         file = join_location(location, WEIGHTS)
         try:
             with fetched(file) as path:
-                self._learner.set_state(load_file(str(path)))
+                self._learner.read_state(path)
         except (SafetensorError, OSError, KeyError) as error:
             raise ValueError(f"{file} cannot be read ({error})") from error
         if len(state["shards"]) != len(self._shards):

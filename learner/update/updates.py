@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -10,16 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from learner.config import RunConfig
+from learner.update.adam import Adam
 from learner.update.double_dqn import minibatch
 from learner.update.gradients import GRADIENTS, FlatNetwork
-
-
-class UpdateStats(NamedTuple):
-    """Means over the updates of one call: loss, action value, absolute TD error."""
-
-    loss: float
-    q_mean: float
-    td_error: float
+from learner.update.stats import UpdateStats
 
 
 class Updates(Protocol):
@@ -51,9 +45,7 @@ class TorchUpdates:
       config: of the run.
     """
 
-    def __init__(
-        self, online: FlatNetwork, target: FlatNetwork, optimiser: torch.optim.Adam, config: RunConfig
-    ) -> None:
+    def __init__(self, online: FlatNetwork, target: FlatNetwork, optimiser: Adam, config: RunConfig) -> None:
         self._online, self._target, self._optimiser, self._config = online, target, optimiser, config
         double = config.algorithm == "double_dqn"
         kind = "autograd" if config.network == "pooled" else config.gradients  # by hand only in compiled updates
@@ -63,8 +55,6 @@ class TorchUpdates:
         self, columns: dict[str, Tensor], learning_rate: float, updates: int
     ) -> tuple[UpdateStats, NDArray[np.float32]]:
         """See `Updates`."""
-        for group in self._optimiser.param_groups:
-            group["lr"] = learning_rate
         device, size = self._online.values.device, self._config.batch_size
         columns = {name: column.to(device) for name, column in columns.items()}
         sums, td_errors = torch.zeros(3, device=device), torch.empty(len(columns["action"]), device=device)
@@ -74,7 +64,7 @@ class TorchUpdates:
             *means, td_errors[rows] = self._gradients(minibatch(columns, rows))
             sums += torch.stack(means)
             self._online.clip_gradients(self._config.max_gradient_norm)
-            self._optimiser.step()
+            self._optimiser.step(learning_rate)
             self._update_target(update)
         return UpdateStats(*(sums / len(starts)).tolist()), td_errors.cpu().numpy()
 

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from sim_core.checks import require
 from sim_core.config import MAX_ROBOTS, WorldConfig
+from sim_core.episode_end import end_of_step
 from sim_core.jit import kernel
 from sim_core.methods.headings import heading_velocities, turn_headings, write_headings
 from sim_core.methods.progress import came_closer
-from sim_core.outcomes import Outcome, end_of_step
+from sim_core.outcomes import Outcome
 from sim_core.packed import packed
 from sim_core.plugins import guarded, refuse
 from sim_core.state import WorldState, own_group

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from sim_core.checks import require
 from sim_core.config import WorldConfig
+from sim_core.episode_end import collision_or_goal, lost_or_captured, sensed
 from sim_core.jit import kernel
 from sim_core.methods.apf import FieldParams, field_of, field_params
 from sim_core.methods.base import EpisodeParams, Method, Preset, Rule, episode_params
@@ -35,7 +36,7 @@ from sim_core.methods.ellipse import (
 from sim_core.methods.headings import heading_velocities
 from sim_core.methods.m_sensor import WORLD as SWARM_WORLD
 from sim_core.methods.progress import came_closer
-from sim_core.outcomes import Outcome, collision_or_goal, lost_or_captured, sensed
+from sim_core.outcomes import Outcome
 from sim_core.packed import packed
 from sim_core.state import WorldState, own_group
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from actors.policy.policy import WeightsSnapshot
-from actors.rollout.vector_env import EnvSpec, env_shape
+from actors.rollout.env_spec import EnvSpec
+from actors.rollout.vector_env import env_shape
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig
 

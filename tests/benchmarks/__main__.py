@@ -13,6 +13,7 @@ from learner.ray_backend.auth import guard_ray  # noqa: E402
 from tests.benchmarks import simulator  # noqa: E402
 
 BENCHMARKS = (
+    "startup",
     "simulator",
     "replay",
     "learner",
@@ -38,6 +39,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--picture", action="store_true", help="`scaling` draws the picture of the model in this folder's README anew"
     )
+    parser.add_argument("--against", type=Path, metavar="PATH", help="`startup`: another checkout to compare with")
     options = parser.parse_args(arguments)
     for name in options.names:
         if name not in BENCHMARKS:
@@ -45,6 +47,8 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     for path in options.rvo2:
         if not path.is_file():
             parser.error(f"--rvo2: there is no file {path}")
+    if options.against is not None and not (options.against / "deploy" / "cli.py").is_file():
+        parser.error(f"--against: there is no checkout in {options.against}")
     return options
 
 
@@ -54,6 +58,8 @@ def main() -> int:
     for name in options.names or BENCHMARKS:
         if name == "simulator":
             simulator.main(options.sections, [path.resolve() for path in options.rvo2])
+        elif name == "startup":
+            importlib.import_module("tests.benchmarks.startup").main(options.against)
         elif name == "scaling":
             importlib.import_module("tests.benchmarks.scaling").main(options.picture)
         else:  # imported here, as their libraries take seconds that the simulator's processes need not wait

@@ -19,7 +19,7 @@ import sim_core  # noqa: F401  registers our environment, in whatever process th
 from actors.evaluation.evaluator import evaluate
 from actors.policy.network import snapshot
 from actors.policy.policy import WeightsSnapshot
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from learner.config import RunConfig, from_dict, to_dict
 from learner.training.evaluation_summary import score, summarise
 

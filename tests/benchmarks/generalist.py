@@ -21,7 +21,7 @@ from rich.table import Table
 from actors.evaluation.evaluator import Candidate
 from actors.evaluation.statistics import Estimate, mean
 from actors.policy.baselines import Baseline, exists
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from actors.service.messages import EpisodeStats
 from deploy.cli import main as shoal
 from deploy.runs.policy_lookup import find_policy

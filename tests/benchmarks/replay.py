@@ -23,7 +23,7 @@ from actors.replay.node import ShardSettings, make_shard
 from actors.replay.prioritised import PrioritySettings
 from actors.rollout.worker import join_stats
 from actors.service.messages import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
-from learner.update.double_dqn import importance_weights
+from learner.update.importance import importance_weights
 from learner.update.learner import Columns
 from tests.benchmarks.timing import ratio, spread, stopwatch, timed_rates
 from tests.packed import pack_as_collected

@@ -16,7 +16,7 @@ from actors.evaluation.evaluator import evaluate
 from actors.evaluation.result_table import GROUPS, ROBOTS
 from actors.evaluation.statistics import as_percent, paired_comparison, rate
 from actors.policy.baselines import Baseline
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from learner.presets import preset_config
 from sim_core import ENV_ID
 from sim_core.outcomes import Outcome

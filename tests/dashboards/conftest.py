@@ -11,7 +11,8 @@ import pytest
 from actors.evaluation.trajectory import Episode
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
-from sim_core.worlds import Pilot, WorldBatch
+from sim_core.pilot import Pilot
+from sim_core.worlds import WorldBatch
 from tests.dashboards.chromium import open_chromium
 
 Recorder = Callable[..., Episode]

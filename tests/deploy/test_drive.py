@@ -18,7 +18,8 @@ from actors.evaluation.evaluator import record_episode
 from actors.evaluation.trajectory import BY_HAND, Episode
 from actors.policy.baselines import Baseline
 from actors.policy.policy import WeightsSnapshot
-from actors.rollout.vector_env import EnvSpec, env_shape
+from actors.rollout.env_spec import EnvSpec
+from actors.rollout.vector_env import env_shape
 from dashboards.pages.player import player_data
 from deploy.drive import PERSON, SCENES, DrivenRun, Result, drive_server, driven_store, load_driven, played, total
 from learner.run_folder import RunFolder

@@ -20,7 +20,7 @@ import deploy
 from actors.evaluation.evaluator import record_episode
 from actors.evaluation.trajectory import Episode
 from actors.policy.network import snapshot
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from deploy.commands.export import metadata
 from learner.config import RunConfig
 from learner.export.reference_states import swarm_states

@@ -24,8 +24,8 @@ from hypothesis.extra import numpy as st_numpy
 from numpy.typing import NDArray
 from safetensors.numpy import load_file
 
-import deploy.commands.train
 import deploy.runs.artifacts
+import learner.tracking.mlflow_run
 from actors.evaluation import evaluator
 from actors.replay.shard import ReplayShard
 from actors.rollout.foreign_env import rehearse_env
@@ -246,7 +246,7 @@ def env_workplace(folder: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.delenv("MLFLOW_TRACKING_URI", raising=False)
-        patch.setattr(deploy.commands.train, "Tracker", QuietTracker)
+        patch.setattr(learner.tracking.mlflow_run, "Tracker", QuietTracker)
         patch.setattr(deploy.runs.artifacts, "learning_curve_png", lambda points, path, *more: path.touch())
         patch.setattr(evaluator, "MAX_EPISODE_STEPS", LONGEST)
         patch.setattr(ReplayShard, "add", checked)

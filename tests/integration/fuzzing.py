@@ -91,7 +91,7 @@ def workplace(folder: Path) -> Iterator[None]:
     (folder / "results.csv").write_text("preset,policy\n")
     ports = {
         deploy.training: ("RunSession", "Tracker"),
-        deploy.commands.train: ("Tracker",),
+        deploy.commands.train: ("open_early",),
         deploy.commands.sweep: ("run_cells", "Tracker"),
         deploy.commands.evaluate: ("evaluate_in_tasks", "record_episode"),
         deploy.commands.stress: ("evaluate_each",),

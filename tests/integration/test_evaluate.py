@@ -15,7 +15,8 @@ from actors.evaluation.evaluator import evaluate
 from actors.evaluation.trajectory import load_episodes
 from actors.policy.baselines import Baseline
 from actors.policy.network import QNetwork, snapshot
-from actors.rollout.vector_env import EnvSpec, env_shape
+from actors.rollout.env_spec import EnvSpec
+from actors.rollout.vector_env import env_shape
 from deploy.cli import main
 from deploy.commands import evaluate as playing
 from deploy.commands.evaluate import episodes_path

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from sim_core.config import WorldConfig
-from sim_core.worlds import Pilot, WorldBatch
+from sim_core.pilot import Pilot
+from sim_core.worlds import WorldBatch
 from tests.sim_core.kernels import orca_velocities
 from tests.sim_core.orca_scenes import (
     GENERIC_KINDS,

@@ -13,9 +13,10 @@ from gymnasium.utils.env_checker import check_env
 
 import deploy
 from sim_core import ENV_ID, ConfigError, WorldConfig, kernel_cache
+from sim_core.pilot import Pilot
 from sim_core.plugins import SOURCES, PluginError, _materialised
 from sim_core.render import draw_world
-from sim_core.worlds import Pilot, WorldBatch, rehearse
+from sim_core.worlds import WorldBatch, rehearse
 
 EXAMPLES = Path(deploy.__file__).parent / "examples"
 COMPASS, FAST_COMPASS = f"{EXAMPLES}/compass.py:Compass", f"{EXAMPLES}/compass_kernel.py:FastCompass"

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from sim_core.config import WorldConfig
-from sim_core.worlds import Pilot, WorldBatch
+from sim_core.pilot import Pilot
+from sim_core.worlds import WorldBatch
 from tests.sim_core.orca_scenes import KINDS, numbered_scene, world_scene
 from tests.sim_core.precision import drifts, one_step_difference
 

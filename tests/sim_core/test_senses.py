@@ -12,8 +12,9 @@ from sim_core.config import WorldConfig
 from sim_core.jit import kernel
 from sim_core.methods.headings import heading_velocities
 from sim_core.outcomes import Outcome
+from sim_core.pilot import Pilot
 from sim_core.rng import add_normal
-from sim_core.worlds import Pilot, WorldBatch
+from sim_core.worlds import WorldBatch
 from tests.sim_core.senses_oracle import Oracle, normal_pair
 
 WORLD = {"robots": 5, "groups": 3, "arena_radius_m": 1.5, "robot_radius_m": 0.06, "orca_radius_m": 0.18}

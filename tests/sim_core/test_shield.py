@@ -7,13 +7,14 @@ import pytest
 
 from actors.evaluation.evaluator import evaluate
 from actors.policy.baselines import Baseline
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
+from sim_core.pilot import Pilot
 from sim_core.shield import SPEED_MARGIN, Shield
 from sim_core.state import empty_state
-from sim_core.worlds import Pilot, WorldBatch
+from sim_core.worlds import WorldBatch
 from tests.sim_core.orca_scenes import GENERIC_KINDS, KINDS, numbered_scene
 from tests.sim_core.parity import BOUND_M_S, compare, total
 from tests.sim_core.test_orca_programs import closest_permitted, least_violation, violation

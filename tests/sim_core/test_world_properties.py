@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_core.config import WorldConfig
-from sim_core.worlds import Pilot, WorldBatch
+from sim_core.pilot import Pilot
+from sim_core.worlds import WorldBatch
 
 STEPS, MAX_WORLDS = 50, 17
 SETUPS = {  # robots, groups, arena radius (m; small, so that groups meet soon), whether the swarm knows the learner

@@ -5,7 +5,8 @@ import pytest
 
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
-from sim_core.worlds import Pilot, WorldBatch, is_done, is_terminated
+from sim_core.pilot import Pilot
+from sim_core.worlds import WorldBatch, is_done, is_terminated
 
 SEEDS = list(range(40, 48))
 SETTINGS = {"robots": 5, "groups": 2, "arena_radius_m": 2.0}

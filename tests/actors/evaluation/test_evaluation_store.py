@@ -8,7 +8,7 @@ import zarr
 
 from actors.evaluation import evaluation_store
 from actors.evaluation.evaluation_store import StoredEvaluation, load_evaluation, save_evaluation
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from actors.service.messages import EpisodeStats
 from actors.storage import zarr_columns
 from sim_core import ENV_ID

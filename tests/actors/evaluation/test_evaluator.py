@@ -10,8 +10,8 @@ from actors.evaluation import evaluator
 from actors.evaluation.evaluator import evaluate, evaluate_in_parallel, record_episode, record_frames
 from actors.policy.baselines import PILOTS, Baseline
 from actors.policy.policy import Policy
+from actors.rollout.env_spec import EnvSpec
 from actors.rollout.foreign_env import EnvError
-from actors.rollout.vector_env import EnvSpec
 from actors.service.messages import NO_OUTCOME
 from actors.service.rpc import LocalCalls
 from sim_core import ENV_ID
@@ -19,7 +19,8 @@ from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 from sim_core.envs import SwarmEnv
 from sim_core.outcomes import Outcome
-from sim_core.worlds import Pilot, WorldBatch
+from sim_core.pilot import Pilot
+from sim_core.worlds import WorldBatch
 
 SEEDS = [2_000_000_000 + i for i in range(7)]
 

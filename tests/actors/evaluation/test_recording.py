@@ -9,7 +9,8 @@ from actors.evaluation.recording import Recording
 from actors.evaluation.trajectory import BY_HAND, load_episodes, save_episodes
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
-from sim_core.worlds import Command, Pilot, WorldBatch
+from sim_core.pilot import Pilot
+from sim_core.worlds import Command, WorldBatch
 
 WORLD = WorldConfig(robots=4, groups=2, arena_radius_m=2.0, horizon_steps=40)
 

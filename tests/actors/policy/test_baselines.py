@@ -10,7 +10,8 @@ import pytest
 from actors.policy.baselines import Baseline, MethodRule, RandomRule, make_baseline
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
-from sim_core.worlds import Pilot, WorldBatch
+from sim_core.pilot import Pilot
+from sim_core.worlds import WorldBatch
 
 Q4 = WorldConfig(sectors=4)
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+from actors.rollout.env_spec import EnvSpec
 from actors.rollout.joined_env import JoinedVectorEnv
-from actors.rollout.vector_env import EnvSpec, final_observations, make_vector_env, reset_seeded, spaces_of
+from actors.rollout.vector_env import final_observations, make_vector_env, reset_seeded, spaces_of
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig
 from sim_core.envs import SwarmVectorEnv

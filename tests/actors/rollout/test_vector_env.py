@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from actors.rollout.vector_env import EnvSpec, env_shape, final_observations, make_vector_env, reset_seeded, spaces_of
+from actors.rollout.env_spec import EnvSpec
+from actors.rollout.vector_env import env_shape, final_observations, make_vector_env, reset_seeded, spaces_of
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 from sim_core.envs import SwarmEnv, SwarmVectorEnv

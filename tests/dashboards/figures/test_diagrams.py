@@ -30,7 +30,8 @@ from dashboards.figures.diagrams import (
 from dashboards.figures.style import save_png
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
-from sim_core.worlds import Pilot, WorldBatch
+from sim_core.pilot import Pilot
+from sim_core.worlds import WorldBatch
 
 SENSOR_WORLD = WorldConfig(robots=10, groups=3, method="sensor")
 OUTSIDE_WORLD = WorldConfig(robots=10, groups=3, method="out", learner_speed_limit_m_s=1.2)

@@ -7,7 +7,7 @@ import pytest
 
 from actors.evaluation.evaluator import evaluate
 from actors.policy.baselines import Baseline
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from dashboards.figures import example_episodes
 from dashboards.figures.diagrams import Diagram
 from dashboards.figures.example_episodes import EXAMPLES, draw_example, first_episode

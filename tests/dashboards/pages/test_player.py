@@ -17,7 +17,7 @@ import pytest
 from actors.evaluation.evaluator import record_episode
 from actors.evaluation.trajectory import Episode
 from actors.policy.baselines import Baseline
-from actors.rollout.vector_env import EnvSpec
+from actors.rollout.env_spec import EnvSpec
 from dashboards.pages.player import VERDICTS, player_data, player_html
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig

@@ -9,7 +9,7 @@ from actors.service.messages import BlockHeader, BlockReport, EpisodeStats
 from learner.training import meters as meters_module
 from learner.training.meters import Meters
 from learner.update.learner_node import UpdateReport
-from learner.update.updates import UpdateStats
+from learner.update.stats import UpdateStats
 
 
 def report(outcomes, returns, lengths, env_steps=100, staleness_updates=0, staleness_s=0.0, rate=0.5):

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from actors.policy.network import PooledNetwork, QNetwork
+from learner.update.adam import Adam
 from learner.update.compiled_updates import CompiledUpdates
 from learner.update.gradients import FlatNetwork
 from learner.update.updates import TorchUpdates
@@ -24,7 +25,7 @@ def maker(ways, config, shape, num_actions):
     torch.manual_seed(0)
     sizes = (int(np.prod(shape)), config.hidden_sizes, num_actions)
     online, target = FlatNetwork(QNetwork(*sizes)), FlatNetwork(QNetwork(*sizes))
-    optimiser = torch.optim.Adam([online.values], fused=True)
+    optimiser = Adam(online.values)
     return ways(online, target, optimiser, config), online, target, optimiser
 
 
@@ -33,7 +34,7 @@ def pooled_maker(ways, config, rows, row_size):
     torch.manual_seed(0)
     networks = [PooledNetwork(rows * row_size, config.hidden_sizes, 6, row_size) for _ in range(2)]
     online, target = map(FlatNetwork, networks)
-    optimiser = torch.optim.Adam([online.values], fused=True)
+    optimiser = Adam(online.values)
     return ways(online, target, optimiser, config), online, target, optimiser
 
 
@@ -115,7 +116,7 @@ def test_an_update_equals_that_of_autograd(
     scale = float(other_online.values.grad.abs().max())
     assert scale > 1e-4
     torch.testing.assert_close(online.values.grad, other_online.values.grad, rtol=1e-3, atol=1e-5 * scale)
-    state, other_state = optimiser.state[online.values], other_optimiser.state[other_online.values]
+    state, other_state = optimiser.state, other_optimiser.state
     assert float(state["step"]) == float(other_state["step"]) == 5
     for name in ("exp_avg", "exp_avg_sq"):
         largest = float(other_state[name].abs().max())

@@ -18,7 +18,7 @@ from actors.service.rpc import Done, LocalCalls
 from actors.service.stopwatch import Stopwatch
 from learner.config import RunConfig
 from learner.update import learner_node as node_module
-from learner.update.double_dqn import importance_weights
+from learner.update.importance import importance_weights
 from learner.update.learner import Learner
 from learner.update.learner_node import LearnerNode
 from sim_core.config import WorldConfig
@@ -440,7 +440,7 @@ def test_moments_that_are_not_finite_are_not_saved(make_learner, make_rows, tmp_
     learner, _ = make_learner()
     learner.add(make_block(make_rows(30)))
     learner.update(1, RATE)
-    state = learner._learner.optimiser.state[learner._learner._online.values]
+    state = learner._learner.optimiser.state
     state["exp_avg_sq"][0] = np.inf
     with pytest.raises(Diverged, match="optimiser.exp_avg_sq is not finite after 1 updates"):
         learner.save(tmp_path / "c")

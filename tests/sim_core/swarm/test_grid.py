@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 
 from sim_core.config import WorldConfig
 from sim_core.lanes import LANES
+from sim_core.pilot import Pilot
 from sim_core.swarm import step
 from sim_core.swarm import tile as tile_module
 from sim_core.swarm.grid import ROW_SPAN_CELLS
-from sim_core.worlds import Pilot, WorldBatch
+from sim_core.worlds import WorldBatch
 from tests.sim_core.kernels import cell_list, orca_step
 from tests.sim_core.swarm.test_neighbours import brute_force
 

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_core.config import WorldConfig
-from sim_core.worlds import Pilot, WorldBatch
+from sim_core.pilot import Pilot
+from sim_core.worlds import WorldBatch
 from tests.sim_core.kernels import orca_step
 from tests.sim_core.swarm.test_neighbours import brute_force
 

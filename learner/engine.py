@@ -1,0 +1,58 @@
+"""Starts a run's components under its engine: as Ray actors, or in this process."""
+
+from __future__ import annotations
+
+import importlib
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from actors.service.rpc import Calls, LocalCalls
+from learner.cluster_options import ClusterOptions
+from learner.config import RunConfig
+from learner.ray_backend.cluster import RayCluster, task_calls
+from learner.training.cluster import Cluster, ProcessCluster
+from sim_core.checks import ConfigError
+
+
+def open_cluster(config: RunConfig, incarnation: int, options: ClusterOptions) -> Cluster:
+    """Starts the run's components under its engine."""
+    if config.engine == "process":
+        return ProcessCluster(config, incarnation)
+    return RayCluster(config, incarnation, options)
+
+
+def open_early(config: RunConfig, options: ClusterOptions, imports: str) -> Cluster | None:
+    """Starts the components of a new run, before anything else of it, where they start in other processes.
+
+    They then start while this process does the rest, such as opening MLflow's store. Meanwhile a thread imports the
+    module `imports`, since this process mostly waits for Ray. In one process there is nothing to gain: None.
+
+    Raises:
+      ConfigError: see `RayCluster`.
+    """
+    if config.engine == "process":
+        return None
+    threading.Thread(target=importlib.import_module, args=(imports,)).start()
+    return open_cluster(config, 0, options)
+
+
+@contextmanager
+def closed_if_refused(cluster: Cluster | None) -> Iterator[None]:
+    """Closes the components if the `with` block raises a ConfigError."""
+    try:
+        yield
+    except ConfigError:
+        if cluster is not None:
+            cluster.close()
+        raise
+
+
+@contextmanager
+def open_calls(config: RunConfig, options: ClusterOptions) -> Iterator[tuple[Calls, int]]:
+    """Calls for tasks alone, without the run's components, under its engine; and how many to make at once."""
+    if config.engine == "process":
+        yield LocalCalls(), 1
+    else:
+        with task_calls(options.address) as calls:
+            yield calls

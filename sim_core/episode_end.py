@@ -1,0 +1,105 @@
+"""Kernels that decide how an episode ends; `sim_core.outcomes` defines the outcomes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim_core.jit import kernel
+from sim_core.outcomes import Outcome
+
+_GOAL, _LOST, _CAPTURED = int(Outcome.GOAL), int(Outcome.LOST), int(Outcome.CAPTURED)
+_COLLISION, _RUNNING = int(Outcome.COLLISION), int(Outcome.RUNNING)
+
+
+@kernel
+def collides(robot, pos_x, pos_y, distance_sq):
+    """Whether any other robot's centre is nearer than the square root of `distance_sq` (m^2)."""
+    for other in range(pos_x.shape[0]):
+        dx, dy = pos_x[other] - pos_x[robot], pos_y[other] - pos_y[robot]
+        if other != robot and dx * dx + dy * dy < distance_sq:
+            return True
+    return False
+
+
+@kernel
+def sensed(robot, begin, end, pos_x, pos_y, range_sq):
+    """(own, others): robots of the own group begin..end-1 and of other groups within the sensing range."""
+    own, others = -1, 0  # the robot itself is not counted
+    for other in range(pos_x.shape[0]):
+        dx, dy = pos_x[other] - pos_x[robot], pos_y[other] - pos_y[robot]
+        if dx * dx + dy * dy < range_sq:
+            mate = begin <= other < end
+            own, others = own + mate, others + (not mate)
+    return own, others
+
+
+@kernel
+def group_goal_distance_m(begin, end, pos_x, pos_y, goal_x, goal_y, of_centroid):
+    """Mean distance of the robots begin..end-1 to the point (goal_x, goal_y), or their centroid's (Eq. 3.2), metres."""
+    if of_centroid:
+        sum_x, sum_y = 0.0, 0.0
+        for i in range(begin, end):
+            sum_x, sum_y = sum_x + (pos_x[i] - goal_x), sum_y + (pos_y[i] - goal_y)
+        return np.sqrt(sum_x * sum_x + sum_y * sum_y) / (end - begin)
+    total = 0.0
+    for i in range(begin, end):
+        dx, dy = pos_x[i] - goal_x, pos_y[i] - goal_y
+        total += np.sqrt(dx * dx + dy * dy)
+    return total / (end - begin)
+
+
+@kernel
+def collision_or_goal(robot, begin, end, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m, of_centroid):
+    """COLLISION or GOAL where one holds after a step, else RUNNING; the same for every method.
+
+    The robot's group are the robots begin..end-1, its goal is (goal_x, goal_y); `of_centroid` as `group_distance` says.
+    """
+    if collides(robot, pos_x, pos_y, collision_sq):
+        return _COLLISION
+    if group_goal_distance_m(begin, end, pos_x, pos_y, goal_x, goal_y, of_centroid) < range_m:
+        return _GOAL
+    return _RUNNING
+
+
+@kernel
+def _all_on_one_side(robot, edge, pos_x, pos_y, range_sq):
+    """Whether no sensed robot is to the right of the line from `robot` through the robot `edge`."""
+    edge_x, edge_y = pos_x[edge] - pos_x[robot], pos_y[edge] - pos_y[robot]
+    for other in range(pos_x.shape[0]):
+        dx, dy = pos_x[other] - pos_x[robot], pos_y[other] - pos_y[robot]
+        if dx * dx + dy * dy < range_sq and edge_x * dy - edge_y * dx < 0.0:
+            return False
+    return True
+
+
+@kernel
+def surrounded(robot, pos_x, pos_y, range_sq):
+    """Whether a robot stands inside the convex hull of those that it senses: none is a tangent point from it."""
+    nobody = True
+    for other in range(pos_x.shape[0]):
+        dx, dy = pos_x[other] - pos_x[robot], pos_y[other] - pos_y[robot]
+        if other != robot and dx * dx + dy * dy < range_sq:
+            nobody = False
+            if _all_on_one_side(robot, other, pos_x, pos_y, range_sq):
+                return False
+    return not nobody
+
+
+@kernel
+def lost_or_captured(robot, begin, end, pos_x, pos_y, range_sq, must_surround):
+    """How a robot fails that is away from its group; `must_surround` as `captured_is` has it."""
+    own, others = sensed(robot, begin, end, pos_x, pos_y, range_sq)
+    if own > 0 or others == 0 or (must_surround and not surrounded(robot, pos_x, pos_y, range_sq)):
+        return _LOST
+    return _CAPTURED
+
+
+@kernel
+def end_of_step(robot, begin, end, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m, of_centroid, must_surround):
+    """Outcome of one world after a step of a robot that is lost once it senses no own robot."""
+    ended = collision_or_goal(robot, begin, end, pos_x, pos_y, goal_x, goal_y, collision_sq, range_m, of_centroid)
+    if ended != _RUNNING:
+        return ended
+    range_sq = range_m * range_m
+    own, _ = sensed(robot, begin, end, pos_x, pos_y, range_sq)
+    return lost_or_captured(robot, begin, end, pos_x, pos_y, range_sq, must_surround) if own == 0 else _RUNNING

@@ -1,0 +1,232 @@
+"""How long a user waits: from a command to its first result, from the end of a training to its summary, and for a run
+whose driver was killed.
+
+Every command runs in a process of its own, in turn with the import of numpy, the unit that cancels the machine's load
+out. With `--against`, each also runs from another checkout, in the same round.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter, defaultdict
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import psutil
+from rich.console import Console
+from rich.table import Table
+
+import deploy
+from learner.file_names import CHECKPOINTS, IDENTITY, JOURNAL
+from learner.tracking.journal import read_rows
+from tests.benchmarks.processes import kind_of
+from tests.benchmarks.timing import ratio, spread
+
+ROUNDS = 3
+HERE = Path(deploy.__file__).parents[1]
+UNIT = "import numpy"
+HELP, ENVIRONMENT = "shoal --help", "import sim_core, make, reset"
+RESET = "import gymnasium, sim_core; gymnasium.make(sim_core.ENV_ID, robots=10, groups=2).reset(seed=0)"
+ENGINES = {"ray": "over Ray", "process": "in one process"}
+TRAINING = ["--robots", "10", "--groups", "2", "--total-env-steps", "100000", "--log-every-env-steps", "1"]
+"""A row of metrics a block, so that the first row tells when the first block of transitions was stored."""
+RECOVERED = "driver killed to the next update, --supervise"
+BEGUN, STORED, ENDED = "run in MLflow", "first stored transition", "end of training to summary"
+TARGETS_S = {
+    HELP: 0.4,
+    RECOVERED: 20.0,
+    ENVIRONMENT: 1.5,
+    f"train over Ray: {STORED}": 5.0,
+    f"train in one process: {STORED}": 2.5,
+    f"train over Ray: {ENDED}": 3.0,
+    f"train in one process: {ENDED}": 3.0,
+    f"train over Ray, cold kernels: {STORED}": 30.0,
+    f"train in one process, cold kernels: {STORED}": 30.0,
+}
+ENDLESS = ["--total-env-steps", "100000000", "--log-every-env-steps", "1", "--checkpoint-every-env-steps", "50000"]
+POLL_S = 0.02
+
+
+class Training(NamedTuple):
+    """Seconds from the command to each phase, and CPU seconds by kind of process until the first stored transition."""
+
+    seconds: dict[str, float]
+    cpu_s: Counter[str]
+
+
+def environment(checkout: Path, **more: str) -> dict[str, str]:
+    kept = {name: value for name, value in os.environ.items() if name not in ("PYTHONDONTWRITEBYTECODE", *more)}
+    return kept | {"PYTHONPATH": str(checkout), "PYTHONUNBUFFERED": "1"} | more
+
+
+def seconds_of(checkout: Path, *arguments: str) -> float:
+    """Seconds of a whole process of Python."""
+    start_s = time.perf_counter()
+    order = [sys.executable, *arguments]
+    subprocess.run(order, check=True, env=environment(checkout), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return time.perf_counter() - start_s
+
+
+def cpu_seconds(driver: psutil.Process) -> Counter[str]:
+    """CPU seconds so far of a training's processes, by kind."""
+    found: Counter[str] = Counter()
+    with suppress(psutil.NoSuchProcess):
+        found["driver"] = sum(driver.cpu_times()[:2])
+        for process in driver.children(recursive=True):
+            with suppress(psutil.NoSuchProcess):
+                found[kind_of(process)] += sum(process.cpu_times()[:2])
+    return found
+
+
+def first_row_s(run: Path) -> float | None:
+    """When the first row of metrics was measured, seconds since the epoch; None while there is none."""
+    return next((row.time_ms / 1e3 for row in read_rows(run / JOURNAL)), None)
+
+
+def train(checkout: Path, engine: str, **more: str) -> Training:
+    """A whole training, with its evaluation and artifacts.
+
+    Raises:
+      RuntimeError: it failed.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "runs" / "timed"
+        order = [sys.executable, "-m", "deploy", "train", "--engine", engine, "--name", run.name, *TRAINING]
+        start_s, lines = time.time(), list[tuple[float, str]]()
+        child = subprocess.Popen(
+            [*order, "--runs-dir", str(run.parent)],
+            env=environment(checkout, **more),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+        def read() -> None:
+            for line in child.stdout or ():
+                lines.append((time.time(), line))
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        while (stored_s := first_row_s(run)) is None and child.poll() is None:
+            time.sleep(POLL_S)
+        cpu_s = cpu_seconds(psutil.Process(child.pid)) if child.poll() is None else Counter[str]()
+        reader.join()
+        if child.wait() or stored_s is None:
+            raise RuntimeError("".join(line for _, line in lines))
+        done_s, summary_s = (
+            next(at_s for at_s, line in lines if line.startswith(words)) for words in ("training done", "trained")
+        )
+        begun_s = (run / IDENTITY).stat().st_mtime
+        return Training({BEGUN: begun_s - start_s, STORED: stored_s - start_s, ENDED: summary_s - done_s}, cpu_s)
+
+
+def recover() -> float:
+    """Seconds from kill -9 of the driver of a supervised training over Ray to its next update."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "runs" / "timed"
+        order = [sys.executable, "-m", "deploy", "train", "--supervise", "--name", run.name, *ENDLESS]
+        with (Path(folder) / "log").open("w") as log:
+            child = subprocess.Popen(
+                [*order, "--runs-dir", str(run.parent)], env=environment(HERE), stdout=log, stderr=log
+            )
+        try:
+            while not list((run / CHECKPOINTS).glob("step-*")):
+                time.sleep(POLL_S)
+            (driver,) = psutil.Process(child.pid).children()
+            driver.kill()
+            killed_s, updated_s = time.time(), list[float]()
+            while not updated_s:
+                time.sleep(POLL_S)
+                rows = [row for row in read_rows(run / JOURNAL) if "train/loss" in row.metrics]
+                updated_s = [row.time_ms / 1e3 for row in rows if row.time_ms / 1e3 > killed_s]
+            return updated_s[0] - killed_s
+        finally:
+            child.terminate()
+            child.wait()
+
+
+class Findings:
+    """Seconds of what is measured, by checkout and name, and CPU seconds of the trainings."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[Path, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+        self.cpu_s: dict[Path, dict[str, list[Counter[str]]]] = defaultdict(lambda: defaultdict(list))
+
+    def add(self, checkout: Path, how: str, training: Training) -> None:
+        for phase, seconds in training.seconds.items():
+            self.seconds[checkout][f"train {how}: {phase}"].append(seconds)
+        self.cpu_s[checkout][how].append(training.cpu_s)
+
+    def measure(self, checkout: Path) -> None:
+        """One round."""
+        found = self.seconds[checkout]
+        found[UNIT].append(seconds_of(checkout, "-c", UNIT))
+        found[HELP].append(seconds_of(checkout, "-m", "deploy", "--help"))
+        found[ENVIRONMENT].append(seconds_of(checkout, "-c", RESET))
+        for engine, how in ENGINES.items():
+            self.add(checkout, how, train(checkout, engine))
+
+    def measure_cold(self, checkout: Path) -> None:
+        """Once with kernels to compile."""
+        for engine, how in ENGINES.items():
+            with tempfile.TemporaryDirectory() as folder:
+                training = train(checkout, engine, NUMBA_CACHE_DIR=folder)
+            self.add(checkout, f"{how}, cold kernels", training)
+
+
+def time_table(findings: Findings, other: Path | None) -> Table:
+    table = Table(title="seconds, median (lowest … highest); load cancels in both ratios")
+    for name in ("from the command to", "seconds", f"× {UNIT}", "target, idle", *(("of the other",) if other else ())):
+        table.add_column(name, justify="left" if name.startswith("from") else "right")
+    ours = findings.seconds[HERE]
+    for name, seconds in ours.items():
+        unit = ratio(seconds, ours[UNIT]).text(1) if len(seconds) == len(ours[UNIT]) else ""
+        target = f"≤ {TARGETS_S[name]:g}" if name in TARGETS_S else ""
+        theirs = findings.seconds[other].get(name) if other else None
+        compared = ratio(seconds, theirs).text(2) if theirs else ""
+        table.add_row(name, spread(seconds).text(2), unit, target, *([compared] if other else []))
+    return table
+
+
+def cpu_table(findings: Findings, other: Path | None) -> Table:
+    table = Table(title="CPU seconds until the first stored transition, means")
+    table.add_column("training")
+    table.add_column("process")
+    for name in ("here", *(("the other",) if other else ())):
+        table.add_column(name, justify="right")
+    checkouts = [HERE, *([other] if other else [])]
+    for how in findings.cpu_s[HERE]:
+        means = [mean_counts(findings.cpu_s[checkout][how]) for checkout in checkouts]
+        for kind in sorted(set().union(*means), key=lambda kind: -means[0].get(kind, 0.0)):
+            table.add_row(how, kind, *(f"{each.get(kind, 0.0):.2f}" for each in means))
+        table.add_row(how, "sum", *(f"{sum(each.values()):.2f}" for each in means), end_section=True)
+    return table
+
+
+def mean_counts(counts: list[Counter[str]]) -> dict[str, float]:
+    return {kind: sum(count[kind] for count in counts) / len(counts) for kind in set().union(*counts)}
+
+
+def main(against: Path | None = None) -> None:
+    checkouts, findings = [HERE, *([against.resolve()] if against else [])], Findings()
+    other = checkouts[1] if against else None
+    for checkout in checkouts:
+        train(checkout, "process")  # compiles the kernels, and Python's modules
+    for _ in range(ROUNDS):
+        for checkout in checkouts:
+            findings.measure(checkout)
+        findings.seconds[HERE][RECOVERED].append(recover())
+    for checkout in checkouts:
+        findings.measure_cold(checkout)
+    console = Console(width=120)
+    console.print(time_table(findings, other))
+    console.print(cpu_table(findings, other))
+    console.print(f"load of the machine: {', '.join(f'{load:.1f}' for load in os.getloadavg())} (1, 5, 15 minutes)")
+
+
+if __name__ == "__main__":
+    main()
