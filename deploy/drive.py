@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +29,7 @@ from learner.config import RunConfig, config_hash
 from learner.run_folder import RunFolder
 from sim_core import ENV_ID
 from sim_core.checks import ConfigError, require
-from sim_core.config import WorldConfig
+from sim_core.config import ONE_LEARNER, WorldConfig
 from sim_core.outcomes import OUTCOME_NAMES, Outcome
 from sim_core.worlds import Command
 
@@ -128,7 +129,7 @@ class DrivenRun:
 
     def __init__(self, folder: RunFolder, world: WorldConfig, weights: WeightsSnapshot, first_seed: int) -> None:
         self._folder = folder
-        self._world = world
+        self._world = world = replace(world, learners=ONE_LEARNER)  # a person drives one robot, all others FL-ORCA
         self._spec = EnvSpec(ENV_ID, world)
         self._first_seed = first_seed
         rules = [rule for rule in (*METHOD_RULES, Baseline.FL_ORCA) if exists(rule, world)]

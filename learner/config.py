@@ -18,7 +18,7 @@ from actors.rollout.env_spec import EnvSpec
 from actors.rollout.exploration import Exploration, linear_schedule
 from sim_core import ENV_ID
 from sim_core.checks import ConfigError, check_fields, require
-from sim_core.config import WorldConfig
+from sim_core.config import ONE_LEARNER, WorldConfig
 from sim_core.plugins import METHODS, SCENES, check_unchanged, identity
 
 
@@ -50,7 +50,8 @@ class RunConfig:
     workers: int = 1
     """Rollout workers."""
     envs_per_worker: int = 64
-    """Environments of one rollout worker, stepped as a batch."""
+    """Environments of one rollout worker, stepped as a batch. Where several robots of a world learn, each is one: as
+    many whole worlds as fit, at least one of each setup."""
     steps_per_block: int = 128
     """Env steps of each environment in a block of transitions."""
     exploration: Literal["schedule", "ladder"] = "schedule"
@@ -159,8 +160,8 @@ class RunConfig:
     def __post_init__(self) -> None:
         check_fields(self)
         _check_ranges(self)
-        _check_pairs(self)
         _check_setups(self)
+        _check_pairs(self)
         _check_discount(self)
         _check_network(self)
         _check_augmentation(self)
@@ -176,8 +177,9 @@ class RunConfig:
         """What is learned, for users, such as `sensor 10r×2g`, `sensor in 25 setups` or an environment's id."""
         if not self.env.is_swarm:
             return self.env_id
-        setups = len(self.env.worlds)
-        return f"{self.world.method_name} {self.world.setup if setups == 1 else f'in {setups} setups'}"
+        setups, learners = len(self.env.worlds), self.world.learners
+        several = "" if learners == ONE_LEARNER else f", learners {learners}"
+        return f"{self.world.method_name} {self.world.setup if setups == 1 else f'in {setups} setups'}{several}"
 
     @property
     def name(self) -> str:
@@ -228,8 +230,8 @@ class RunConfig:
 
     @property
     def block_env_steps(self) -> int:
-        """Env steps in one block."""
-        return self.envs_per_worker * self.steps_per_block
+        """Env steps in one block; the most where several robots of a world learn and some wait for its end."""
+        return sum(self.env.counts(self.envs_per_worker)) * self.steps_per_block
 
 
 WHERE = ("engine", "device")
@@ -440,11 +442,18 @@ def from_dict(values: dict[str, Any]) -> RunConfig:
     return RunConfig(**plain)
 
 
+UNCOUNTED = {"learners": ONE_LEARNER, "ended_learners": "fl-orca"}
+"""World settings that hashes leave out at these values: runs from before there were such settings keep their hashes."""
+
+
 def identity_dict(config: RunConfig) -> dict[str, Any]:
     """The config as plain values for hashes: a user's own files count by their names and texts, not their folders."""
     values = to_dict(config)
     for kind in (METHODS, SCENES):
         values["world"][kind.setting] = identity(kind, values["world"][kind.setting])
+    for name, default in UNCOUNTED.items():
+        if values["world"][name] == default:
+            del values["world"][name]
     values["world"]["sources"] = tuple((os.path.basename(path), text) for path, text in config.world.sources)
     return values
 

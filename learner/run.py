@@ -8,10 +8,13 @@ starts from the newest checkpoint. Once all env steps are done, a session only m
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from contextlib import AbstractContextManager, closing, nullcontext
 from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
+
+import numpy as np
 
 from actors.evaluation.evaluator import evaluate_in_parallel
 from actors.policy.policy import WeightsSnapshot
@@ -348,10 +351,11 @@ class RunSession:
 
 def evaluation_by_setup(config: RunConfig, episodes: EpisodeStats) -> dict[str, Evaluation]:
     """Summaries of the final evaluation by setup, such as `10r×2g`; empty where there is only one."""
-    setups, size = config.env.worlds, config.final_eval_episodes
+    setups = config.env.worlds
     if len(setups) == 1:
         return {}
-    chunks = [select_stats(episodes, slice(i * size, (i + 1) * size)) for i in range(len(setups))]
+    ends = np.cumsum([config.final_eval_episodes * learners for learners in config.env.learners()]).tolist()
+    chunks = [select_stats(episodes, slice(*part)) for part in itertools.pairwise([0, *ends])]
     return {world.setup: summarise(chunk) for world, chunk in zip(setups, chunks, strict=True)}
 
 

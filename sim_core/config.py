@@ -6,6 +6,8 @@ kernel. Field names carry their unit (`_m`, `_s`, `_m_s`, `_deg`, `_steps`).
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -27,6 +29,12 @@ LARGEST_REWARD = 1e38
 """Largest reward, which is stored as float32."""
 
 
+ONE_LEARNER = "one"
+"""`learners` of the dissertation: one robot of all groups."""
+MAX_LEAVING_ROBOTS = 299
+"""Most robots of a world that robots may leave: a larger one sorts its robots into a grid."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class WorldConfig:
     """One setup (robots x groups x method) and the world it lives in.
@@ -44,6 +52,10 @@ class WorldConfig:
     your own, FILE.py:CLASS."""
     scene: str = "circle"
     """Start positions and goals: circle (groups cross a circle, 3.1), or your own, FILE.py:CLASS."""
+    learners: str = ONE_LEARNER
+    """Learning robots: `one` of all (the text), or of every group a count (3) or a share (0.25; 1.0: all robots)."""
+    ended_learners: Literal["fl-orca", "leave"] = "fl-orca"
+    """A learning robot whose episode ends before those of others is driven by FL-ORCA, or leaves the world (ours)."""
     swarm_knows_learner: Literal["method", "yes", "no"] = "method"
     """Whether the swarm avoids the learning robot and counts it in its flock (the method's: M_sensor only)."""
     horizon_is: Literal["method", "cut", "failure"] = "method"
@@ -204,10 +216,14 @@ class WorldConfig:
     """Path and text of each file that `method` or `scene` names; read when the settings are made, not to be given."""
 
     def __post_init__(self) -> None:
+        learners: object = self.learners
+        if isinstance(learners, int | float) and not isinstance(learners, bool):
+            object.__setattr__(self, "learners", str(learners))
         check_fields(self)
         _take_sources(self)
         _check_counts(self)
         _check_group_sizes(self)
+        _check_learners(self)
         _check_lengths(self)
         _check_conditions(self)
         self.scene_class.check(self)
@@ -222,6 +238,21 @@ class WorldConfig:
     def group_sizes(self) -> tuple[int, ...]:
         """Robots of each group, as the scene has them."""
         return tuple(int(size) for size in self.scene_class.group_sizes(self))
+
+    @property
+    def learner_counts(self) -> tuple[int, ...]:
+        """Learning robots of each group; empty where one robot of all groups learns."""
+        if self.learners == ONE_LEARNER:
+            return ()
+        if self.learners.isdecimal():
+            return (int(self.learners),) * self.groups
+        share = float(self.learners)
+        return tuple(max(1, math.floor(share * size + 0.5)) for size in self.group_sizes)
+
+    @property
+    def num_learners(self) -> int:
+        """Learning robots of a world."""
+        return sum(self.learner_counts) or 1
 
     def source(self, kind: Kind) -> str:
         """The text of the user's own file that a setting names; empty where it names none."""
@@ -323,6 +354,29 @@ def _check_group_sizes(config: WorldConfig) -> None:
     require(
         len(sizes) == config.groups and min(sizes) >= 2 and sum(sizes) <= MAX_ROBOTS,
         f"scene {scene.__name__} must have groups ({config.groups}) sizes of at least 2 robots, not {sizes}",
+    )
+
+
+LEARNERS = re.compile(r"[1-9][0-9]*|0?\.[0-9]*[1-9][0-9]*|1\.0*")
+
+
+def _check_learners(config: WorldConfig) -> None:
+    require(
+        config.learners == ONE_LEARNER or LEARNERS.fullmatch(config.learners) is not None,
+        f"learners must be {ONE_LEARNER} (one robot of all), or of every group a count (3) or a share with a point "
+        f"(0.25; 1.0: all robots), not {config.learners!r}",
+    )
+    smallest = min(config.group_sizes)
+    require(
+        max(config.learner_counts, default=1) <= smallest or not config.learners.isdecimal(),
+        f"learners must be at most {smallest}, the robots of the smallest group, not {config.learners}; a share has a "
+        "point, as in 0.5",
+    )
+    leaves = config.ended_learners == "leave" and config.num_learners > 1
+    require(
+        not leaves or config.num_robots <= MAX_LEAVING_ROBOTS,
+        f"ended_learners must be fl-orca in worlds of more than {MAX_LEAVING_ROBOTS} robots, not leave: "
+        f"{config.setup} has {config.num_robots}",
     )
 
 

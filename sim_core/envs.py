@@ -56,18 +56,21 @@ def observation_space(config: WorldConfig) -> gym.spaces.Box:
     return gym.spaces.Box(-limit, limit, (size * config.history,), method.observation_dtype)
 
 
-def _check_render_mode(render_mode: str | None) -> None:
+def check_render_mode(render_mode: str | None) -> None:
+    """Raises ConfigError if an environment cannot draw in this mode."""
     if render_mode is not None and render_mode not in RENDER_MODES:
         raise ConfigError(f"render_mode must be one of {RENDER_MODES} or None, not {render_mode!r}")
 
 
-def _frames_per_s(config: WorldConfig) -> int:
+def frames_per_s(config: WorldConfig) -> int:
+    """Decisions a second, which are the images a second of a drawing in true time."""
     return max(1, round(1 / config.decision_s))
 
 
-def _draw(worlds: WorldBatch, world: int) -> NDArray[np.uint8]:
-    learner = int(worlds.state.learner[world])
-    return draw_world(worlds.positions()[world], worlds.goals()[world], learner, worlds.config)
+def draw(worlds: WorldBatch, world: int) -> NDArray[np.uint8]:
+    """A world as `[height, width, 3]` uint8."""
+    learners = worlds.state.learner.reshape(worlds.num_worlds, -1)[world]
+    return draw_world(worlds.positions()[world], worlds.goals()[world], learners, worlds.config)
 
 
 class SwarmEnv(gym.Env[NDArray[Any], np.int64]):
@@ -84,9 +87,14 @@ class SwarmEnv(gym.Env[NDArray[Any], np.int64]):
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # gym.make asks the class
 
     def __init__(self, render_mode: str | None = None, **settings: Any) -> None:
-        _check_render_mode(render_mode)
+        check_render_mode(render_mode)
         self.config = make_config(settings)
-        self.metadata = {"render_modes": RENDER_MODES, "render_fps": _frames_per_s(self.config)}
+        require(
+            self.config.num_learners == 1,
+            f"learners must be one in an environment of one agent, not {self.config.learners}: several are rows of "
+            "gymnasium.make_vec, or agents of sim_core.parallel_env",
+        )
+        self.metadata = {"render_modes": RENDER_MODES, "render_fps": frames_per_s(self.config)}
         self.render_mode = render_mode
         self.observation_space = observation_space(self.config)
         self.action_space = cast("gym.Space[np.int64]", gym.spaces.Discrete(self.config.num_actions))
@@ -131,14 +139,14 @@ class SwarmEnv(gym.Env[NDArray[Any], np.int64]):
 
     def render(self) -> NDArray[np.uint8] | None:
         """The world as `[height, width, 3]` uint8 in mode `rgb_array`, else None."""
-        return _draw(self.worlds, 0) if self.render_mode == "rgb_array" else None
+        return draw(self.worlds, 0) if self.render_mode == "rgb_array" else None
 
 
 class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArray[Any]]):
     """A batch of worlds stepped by one call.
 
     Args:
-      num_envs: number of worlds.
+      num_envs: number of rows: of worlds, or of learning robots where several of a world learn.
       render_mode: None or `rgb_array`.
       autoreset_mode: when ended worlds restart (see the module).
       **settings: fields of WorldConfig.
@@ -156,32 +164,43 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
         autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
         **settings: Any,
     ) -> None:
-        _check_render_mode(render_mode)
+        check_render_mode(render_mode)
         modes = list(AutoresetMode)
         require(autoreset_mode in modes, f"autoreset_mode must be one of {modes}, not {autoreset_mode!r}")
         is_count = isinstance(num_envs, int | np.integer) and num_envs >= 1
         require(is_count, f"num_envs must be a whole number of at least 1, not {num_envs!r}")
         self.config = make_config(settings)
+        per_world = self.config.num_learners
+        require(
+            num_envs % per_world == 0,
+            f"num_envs must be a multiple of {per_world}, the learning robots of a world (learners = "
+            f"{self.config.learners}), not {num_envs}",
+        )
+        require(
+            per_world == 1 or autoreset_mode is AutoresetMode.SAME_STEP,
+            f"autoreset_mode must be SAME_STEP where several robots of a world learn, not {autoreset_mode.name}",
+        )
         self.metadata = {
             "autoreset_mode": autoreset_mode,
             "render_modes": RENDER_MODES,
-            "render_fps": _frames_per_s(self.config),
+            "render_fps": frames_per_s(self.config),
         }
         self.render_mode = render_mode
         self.num_envs = int(num_envs)
+        self.num_worlds = self.num_envs // per_world
         self.single_observation_space = observation_space(self.config)
         self.single_action_space = gym.spaces.Discrete(self.config.num_actions)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.worlds = WorldBatch(self.config, self.num_envs)
+        self.worlds = WorldBatch(self.config, self.num_worlds)
         self._begun = False
         self._mode = autoreset_mode
-        self._ended = np.zeros(self.num_envs, np.bool_)  # worlds that are to restart
+        self._ended = np.zeros(self.num_worlds, np.bool_)  # worlds that are to restart
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Starts an episode in every world, or where `options["reset_mask"]` `[num_envs]` bool is True.
+        """Starts episodes in every world, or where `options["reset_mask"]` `[num_worlds]` bool is True.
 
         World i takes `seed + i`, or `seed[i]` of a list. Without a seed it goes on with its random stream; at its
         first reset that is drawn at random.
@@ -189,11 +208,11 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
         Raises:
           ValueError: see `env_seeds` and `reset_mask`; or the mask leaves out a world that has not begun.
         """
-        mask, seeds = reset_mask(options, self.num_envs), env_seeds(seed, self.num_envs)
+        mask, seeds = reset_mask(options, self.num_worlds), env_seeds(seed, self.num_worlds)
         if not self._begun:
             if mask is not None and not mask.all():
                 raise ValueError(f"the first reset must start every world; leave {RESET_MASK} out")
-            drawn = np.random.SeedSequence().generate_state(self.num_envs)
+            drawn = np.random.SeedSequence().generate_state(self.num_worlds)
             seeds = [int(drawn[world]) if own is None else own for world, own in enumerate(seeds)]
             self._begun = True
         if mask is not None:
@@ -205,7 +224,7 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
     def step(
         self, actions: NDArray[np.int64]
     ) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """One env step of every world; `actions` `[num_envs]`. A world that restarts in it takes no action.
+        """One env step of every row; `actions` `[num_envs]`. A world that restarts in it takes no action.
 
         Raises:
           ValueError: an action is none of the action space, or a world has ended and is not to restart by itself.
@@ -218,6 +237,8 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
             raise ValueError(f"worlds {np.flatnonzero(self._ended).tolist()} have ended; reset them with {RESET_MASK}")
         restarted, streams = self._ended, self.worlds.state.rng.copy()
         result = self.worlds.step(actions.astype(np.int64, copy=False))
+        if self.config.num_learners > 1:
+            return self._step_of_robots(result)
         done = is_done(result.outcome) & ~restarted
         terminated = is_terminated(result.outcome, self.config.timeout_fails) & done
         observation, reward = result.observation, result.reward.astype(np.float64)
@@ -233,6 +254,21 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
         self._ended = done
         return observation, reward, terminated, done & ~terminated, infos
 
+    def _step_of_robots(
+        self, result: StepResult
+    ) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """What `step` returns where several robots of a world learn; restarts the worlds that have ended."""
+        done = is_done(result.outcome) & result.decided
+        terminated = is_terminated(result.outcome, self.config.timeout_fails) & done
+        observation, infos = result.observation, {"decided": result.decided}
+        if done.any():
+            infos |= {"final_obs": observation, "_final_obs": done}
+            infos |= {"final_info": _ends(result, done), "_final_info": done}  # type: ignore[dict-item]
+            ended = self.worlds.ended_worlds()
+            if ended.any():
+                observation = self.worlds.reset(ended)
+        return observation, result.reward.astype(np.float64), terminated, done & ~terminated, infos
+
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Copies of all arrays that a checkpoint needs, by name."""
         waiting = {} if self._mode is AutoresetMode.SAME_STEP else {"ended": self._ended.copy()}
@@ -242,14 +278,14 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
         """Takes up saved arrays; returns the observations there (see `WorldBatch.set_state` for errors)."""
         observation = self.worlds.set_state(saved)
         self._begun = True
-        self._ended = saved.get("ended", np.zeros(self.num_envs, np.bool_)).copy()
+        self._ended = saved.get("ended", np.zeros(self.num_worlds, np.bool_)).copy()
         return observation
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One image `[height, width, 3]` uint8 a world in mode `rgb_array`, else None."""
         if self.render_mode != "rgb_array":
             return None
-        return tuple(_draw(self.worlds, world) for world in range(self.num_envs))
+        return tuple(draw(self.worlds, world) for world in range(self.num_worlds))
 
 
 def _ends(result: StepResult, done: NDArray[np.bool_]) -> dict[str, Any]:

@@ -35,17 +35,23 @@ def sensed(robot, begin, end, pos_x, pos_y, range_sq):
 
 @kernel
 def group_goal_distance_m(begin, end, pos_x, pos_y, goal_x, goal_y, of_centroid):
-    """Mean distance of the robots begin..end-1 to the point (goal_x, goal_y), or their centroid's (Eq. 3.2), metres."""
+    """Mean distance of the robots begin..end-1 to the point (goal_x, goal_y), or their centroid's (Eq. 3.2), metres.
+
+    Robots at NaN have left the world and do not count.
+    """
+    count = 0
     if of_centroid:
         sum_x, sum_y = 0.0, 0.0
         for i in range(begin, end):
-            sum_x, sum_y = sum_x + (pos_x[i] - goal_x), sum_y + (pos_y[i] - goal_y)
-        return np.sqrt(sum_x * sum_x + sum_y * sum_y) / (end - begin)
+            if pos_x[i] == pos_x[i]:
+                sum_x, sum_y, count = sum_x + (pos_x[i] - goal_x), sum_y + (pos_y[i] - goal_y), count + 1
+        return np.sqrt(sum_x * sum_x + sum_y * sum_y) / count
     total = 0.0
     for i in range(begin, end):
-        dx, dy = pos_x[i] - goal_x, pos_y[i] - goal_y
-        total += np.sqrt(dx * dx + dy * dy)
-    return total / (end - begin)
+        if pos_x[i] == pos_x[i]:
+            dx, dy = pos_x[i] - goal_x, pos_y[i] - goal_y
+            total, count = total + np.sqrt(dx * dx + dy * dy), count + 1
+    return total / count
 
 
 @kernel

@@ -1,14 +1,14 @@
 """Draws one world state as an RGB image, with numpy alone.
 
 The view is fixed to the arena; x points right and y up. Robots have their true radius (at least 3 px) and their group's
-colour. The learning robot is black with a ring in its group's colour, and its sensing disc of radius R2 is shaded.
-Goals are hollow squares; the learning robot's goal has a black outline. Shapes outside the view are clipped.
+colour. A learning robot is black with a ring in its group's colour; a single one's sensing disc of radius R2 is shaded.
+Goals are hollow squares; those of learning robots have a black outline. Shapes outside the view are clipped.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,14 +60,18 @@ def to_pixels(point_m: ArrayLike, config: WorldConfig, size_px: int) -> Floats:
 
 
 def draw_world(
-    position: NDArray[np.floating], goal: NDArray[np.floating], learner: int, config: WorldConfig, size_px: int = 480
+    position: NDArray[np.floating],
+    goal: NDArray[np.floating],
+    learners: int | Sequence[int] | NDArray[np.integer],
+    config: WorldConfig,
+    size_px: int = 480,
 ) -> NDArray[np.uint8]:
     """Draws one world.
 
     Args:
-      position: `[num_robots, 2]`, metres; group after group (`config.group_sizes`).
+      position: `[num_robots, 2]`, metres; group after group (`config.group_sizes`); NaN: has left the world.
       goal: `[groups, 2]`, metres.
-      learner: index of the learning robot.
+      learners: index of the learning robot, or of all of them.
       config: the setup.
       size_px: edge length of the square image.
 
@@ -80,15 +84,19 @@ def draw_world(
     robot_px, goal_px = to_pixels(position, config, size_px), to_pixels(goal, config, size_px)
     colours = group_rgb(config.groups)
     group = np.repeat(np.arange(config.groups), config.group_sizes)
-    own_group = int(group[learner])
+    there = np.isfinite(robot_px).all(axis=1)
+    learning = np.zeros(len(robot_px), np.bool_)
+    learning[np.atleast_1d(learners)] = True
 
-    _draw_goals(image, goal_px, GOAL_HALF_SIDE_M * px_per_m, colours, own_group)
-    _draw_sensing(image, robot_px[learner], config.outer_radius_m * px_per_m)
-    swarm = np.arange(len(robot_px)) != learner
+    _draw_goals(image, goal_px, GOAL_HALF_SIDE_M * px_per_m, colours, sorted({int(own) for own in group[learning]}))
+    if learning.sum() == 1:
+        _draw_sensing(image, robot_px[learning & there], config.outer_radius_m * px_per_m)
+    swarm = ~learning & there
     swarm_colours = colours[group[swarm]]
     _splat_discs(image, robot_px[swarm], radius_px + 0.6, np.broadcast_to(colour_rgb(OUTLINE), swarm_colours.shape))
     _splat_discs(image, robot_px[swarm], radius_px - 0.4, swarm_colours)
-    _draw_learner(image, robot_px[learner], radius_px, colours[own_group])
+    for robot in np.flatnonzero(learning & there):
+        _draw_learner(image, robot_px[robot], radius_px, colours[group[robot]])
     return image
 
 
@@ -107,19 +115,20 @@ def _background(config: WorldConfig, size_px: int) -> NDArray[np.uint8]:
 
 
 def _draw_goals(
-    image: NDArray[np.uint8], goal_px: Floats, half_px: float, colours: NDArray[np.uint8], own_group: int
+    image: NDArray[np.uint8], goal_px: Floats, half_px: float, colours: NDArray[np.uint8], own_groups: list[int]
 ) -> None:
     half_px = max(half_px, 5.0)
     line_px = max(2.0, 0.25 * half_px)
     for group, centre in enumerate(goal_px):
-        if group == own_group:
+        if group in own_groups:
             _paint(image, centre, half_px + 1.5, _frame(half_px + 1.5, line_px + 3.0), BLACK)
         _paint(image, centre, half_px, _frame(half_px, line_px), colours[group])
 
 
-def _draw_sensing(image: NDArray[np.uint8], centre_px: Floats, radius_px: float) -> None:
-    _paint(image, centre_px, radius_px, _disc(radius_px), SENSING, opacity=0.2)
-    _paint(image, centre_px, radius_px + 1.0, _ring(radius_px, 1.2), SENSING, opacity=0.7)
+def _draw_sensing(image: NDArray[np.uint8], centres_px: Floats, radius_px: float) -> None:
+    for centre_px in centres_px:
+        _paint(image, centre_px, radius_px, _disc(radius_px), SENSING, opacity=0.2)
+        _paint(image, centre_px, radius_px + 1.0, _ring(radius_px, 1.2), SENSING, opacity=0.7)
 
 
 def _draw_learner(image: NDArray[np.uint8], centre_px: Floats, radius_px: float, colour: NDArray[np.uint8]) -> None:

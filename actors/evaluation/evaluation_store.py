@@ -6,7 +6,7 @@ import dataclasses
 import json
 import shutil
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,16 +15,25 @@ import zarr
 from numpy.typing import NDArray
 
 from actors.rollout.env_spec import EnvSpec
-from actors.service.messages import EpisodeStats
+from actors.service.messages import NO_TEAM, TEAM_DTYPE, EpisodeStats
 from actors.storage.atomic_write import replacing_folder
 from actors.storage.zarr_columns import load_rows, open_store, save_rows
 from sim_core.checks import ConfigError, require
 from sim_core.config import WorldConfig
 
 FORMAT = "shoal-evaluation-1"
-EPISODE_DTYPE = np.dtype(
-    [("seed", np.int64), ("outcome", np.int8), ("length_steps", np.int32), ("episode_return", np.float64)]
-)
+TEAM_FORMAT = "shoal-evaluation-2"
+"""With TEAM_DTYPE's columns, where several robots of a world learn."""
+_COLUMNS: list[Any] = [
+    ("seed", np.int64),
+    ("outcome", np.int8),
+    ("length_steps", np.int32),
+    ("episode_return", np.float64),
+]
+EPISODE_DTYPE = np.dtype(_COLUMNS)
+TEAM_NAMES = TEAM_DTYPE.names or ()
+_OF_EPISODES = tuple(name for name in EpisodeStats._fields if name != "team")
+TEAM_EPISODE_DTYPE = np.dtype([*_COLUMNS, *TEAM_DTYPE.descr])
 
 
 class StoredEvaluation(NamedTuple):
@@ -32,7 +41,7 @@ class StoredEvaluation(NamedTuple):
 
     `spec` is the environment, `candidate` the name of a run or a baseline, and `updates` the number of updates applied
     to the policy's weights, 0 for a baseline. `seed` `[episodes]` int64 holds the episodes' seeds in the order of
-    `stats`.
+    `stats` (`entry_seeds`).
     """
 
     spec: EnvSpec
@@ -54,10 +63,11 @@ def save_evaluation(path: Path, evaluation: StoredEvaluation) -> None:
       ConfigError: something exists at `path`.
     """
     refuse_existing(path)
-    rows = np.zeros(len(evaluation.seed), EPISODE_DTYPE)
+    team = evaluation.stats.team
+    rows = np.zeros(len(evaluation.seed), TEAM_EPISODE_DTYPE if len(team) else EPISODE_DTYPE)
     rows["seed"] = evaluation.seed
-    for name, column in evaluation.stats._asdict().items():
-        rows[name] = column
+    for name in (*_OF_EPISODES, *TEAM_NAMES) if len(team) else _OF_EPISODES:
+        rows[name] = team[name] if name in TEAM_NAMES else getattr(evaluation.stats, name)
     header: dict[str, Any] = {
         "env_id": evaluation.spec.env_id,
         "world": dataclasses.asdict(evaluation.spec.world),
@@ -65,7 +75,7 @@ def save_evaluation(path: Path, evaluation: StoredEvaluation) -> None:
         "updates": evaluation.updates,
     }
     with replacing_folder(path) as partial:
-        save_rows(partial, rows, FORMAT)
+        save_rows(partial, rows, TEAM_FORMAT if len(team) else FORMAT)
         zarr.open_group(str(partial), mode="r+").attrs.update({"header": header, "header_crc32": _crc32(header)})
 
 
@@ -75,7 +85,8 @@ def load_evaluation(path: Path) -> StoredEvaluation:
     Raises:
       ValueError: the group is missing or damaged, or is no evaluation.
     """
-    rows = load_rows(path, EPISODE_DTYPE, FORMAT)
+    has_team = open_store(path).attrs.get("format") == TEAM_FORMAT
+    rows = load_rows(path, TEAM_EPISODE_DTYPE, TEAM_FORMAT) if has_team else load_rows(path, EPISODE_DTYPE, FORMAT)
     attributes: Any = open_store(path).attrs.asdict()
     header = attributes.get("header")
     if header is None or _crc32(header) != attributes.get("header_crc32"):
@@ -84,7 +95,10 @@ def load_evaluation(path: Path) -> StoredEvaluation:
         spec = EnvSpec(header["env_id"], WorldConfig(**header["world"]))
     except (TypeError, ConfigError) as error:
         raise ValueError(f"{path} has settings of another version of shoal ({error}); evaluate again") from error
-    stats = EpisodeStats(*(rows[name] for name in EpisodeStats._fields))
+    team = np.zeros(len(rows), TEAM_DTYPE) if has_team else NO_TEAM
+    for name in TEAM_NAMES if has_team else ():
+        team[name] = rows[name]
+    stats = EpisodeStats(**{name: rows[name] for name in _OF_EPISODES}, team=team)
     return StoredEvaluation(spec, header["player"], header["updates"], rows["seed"], stats)
 
 
@@ -95,17 +109,23 @@ def find_evaluation(path: Path, spec: EnvSpec, updates: int, seeds: list[int]) -
       path: a zarr group that belongs to one policy.
       spec: the environment.
       updates: number of updates applied to the policy's weights.
-      seeds: one episode was played per seed.
+      seeds: one world was played per seed.
 
     Returns:
-      One entry per seed, in order.
+      One entry per seed, in order; one per learning robot of each seed's world where several learn.
     """
     try:
         stored = load_evaluation(path)
     except (ValueError, OSError):
         return None
-    is_wanted = (stored.spec, stored.updates, stored.seed.tolist()) == (spec, updates, seeds)
+    wanted = spec, updates, entry_seeds(seeds, stored.stats).tolist()
+    is_wanted = (stored.spec, stored.updates, stored.seed.tolist()) == wanted
     return stored.stats if is_wanted else None
+
+
+def entry_seeds(seeds: Sequence[int], stats: EpisodeStats) -> NDArray[np.int64]:
+    """The seed of every entry of an evaluation of one setup: as many for each seed as robots of its world learn."""
+    return np.repeat(np.array(seeds, np.int64), len(stats.outcome) // max(1, len(seeds)))
 
 
 def stored_or_played(
@@ -117,7 +137,7 @@ def stored_or_played(
         return found
     stats = play()
     shutil.rmtree(path, ignore_errors=True)
-    save_evaluation(path, StoredEvaluation(spec, candidate, updates, np.array(seeds, np.int64), stats))
+    save_evaluation(path, StoredEvaluation(spec, candidate, updates, entry_seeds(seeds, stats), stats))
     return stats
 
 

@@ -1,6 +1,7 @@
 """Evaluation on fixed seeds: one episode per seed, so that short episodes are not over-represented.
 
-The same loop plays learned policies, which act greedily, and baselines.
+The same loop plays learned policies, which act greedily, and baselines. Where several robots of a world learn, a seed
+is a world, in which each of them has an episode.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from actors.rollout.foreign_spaces import shown
 from actors.rollout.vector_env import make_vector_env, reset_seeded
 from actors.rollout.worker import join_stats, select_stats
 from actors.service.fault_policy import Action, CallFailed, ComponentKind, decide
-from actors.service.messages import NO_OUTCOME, EpisodeStats
+from actors.service.messages import NO_OUTCOME, NO_TEAM, TEAM_DTYPE, EpisodeStats
 from actors.service.rpc import Calls, Ref, by_reference
 from sim_core.checks import require
 from sim_core.config import WorldConfig
@@ -78,7 +79,7 @@ def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> EpisodeSt
     """Plays one episode per seed; of n setups, in that of index seed modulo n.
 
     Returns:
-      One entry per seed, in order.
+      One entry per seed, in order; one per learning robot of each seed's world where several learn.
 
     Raises:
       ConfigError: see `make_action_rule`.
@@ -94,7 +95,10 @@ def _evaluate_in_turn(spec: EnvSpec, candidate: Candidate, seeds: NDArray[np.int
     order = np.argsort(seeds % len(worlds), kind="stable")
     parts = [seeds[seeds % len(worlds) == i].tolist() for i in range(len(worlds))]
     played = [evaluate(spec.of_setup(world), candidate, part) for world, part in zip(worlds, parts, strict=True)]
-    return select_stats(join_stats(played), np.argsort(order))
+    learners = np.array([world.num_learners for world in worlds])[seeds[order] % len(worlds)]
+    first = np.cumsum(learners) - learners  # entry of each seed, setup after setup
+    places = [np.arange(first[at], first[at] + learners[at]) for at in np.argsort(order)]
+    return select_stats(join_stats(played), np.concatenate(places))
 
 
 def evaluate_in_parallel(
@@ -110,7 +114,7 @@ def evaluate_in_parallel(
       max_calls: most calls to start.
 
     Returns:
-      One entry per seed, in order.
+      Entries as of `evaluate`.
 
     Raises:
       CallFailed: one of the calls keeps failing.
@@ -155,14 +159,19 @@ class _SwarmEpisodes:
     def __init__(self, config: WorldConfig, seeds: list[int]) -> None:
         self._worlds = WorldBatch(config, len(seeds))
         self._worlds.seed(seeds)
-        self._episode = np.arange(len(seeds))  # index of the episode of every world that is still stepped
+        self._per_world = config.num_learners
+        count = self.num_episodes = self._worlds.num_rows
+        self._seed = np.arange(len(seeds))  # index of the seed of every world that is still stepped
+        self._episode = np.arange(count)  # index of the episode of every row of these worlds
         self._over = np.zeros(len(seeds), np.bool_)  # which of these worlds have ended
+        self._segregation, self._decisions = np.zeros(len(seeds)), np.zeros(len(seeds))
+        self._hit_learner = np.zeros(count, np.bool_)
         self._last = _Step(
             observation=self._worlds.reset(),
-            reward=np.zeros(len(seeds)),
-            ended=np.zeros(len(seeds), np.bool_),
-            outcome=np.zeros(len(seeds), np.int8),
-            steps=np.zeros(len(seeds), np.int32),
+            reward=np.zeros(count),
+            ended=np.zeros(count, np.bool_),
+            outcome=np.zeros(count, np.int8),
+            steps=np.zeros(count, np.int32),
         )
 
     def start(self) -> NDArray[Any]:
@@ -177,18 +186,37 @@ class _SwarmEpisodes:
         last.ended[episode] = done
         last.outcome[episode] = result.outcome
         last.steps[episode] = result.steps
-        self._over |= done
+        if self._per_world > 1:
+            self._watch_team()
+        self._over |= self._worlds.ended_worlds()
         if self._over.mean() >= 0.5 and not self._over.all():
             self._drop_ended()
         return self._last
 
+    def _watch_team(self) -> None:
+        going_on = ~self._over
+        self._segregation[self._seed[going_on]] += self._worlds.segregation()[going_on]
+        self._decisions[self._seed[going_on]] += 1
+        rows = self._worlds.rows_of(going_on)
+        self._hit_learner[self._episode[rows]] = self._worlds.hit_learner[rows]
+
     def _drop_ended(self) -> None:
         running = ~self._over
-        state = {name: array[running] for name, array in self._worlds.get_state().items()}
-        self._episode = self._episode[running]
-        self._over = self._over[running]
-        self._worlds = WorldBatch(self._worlds.config, len(self._episode))
-        self._worlds.set_state(state)
+        self._episode = self._episode[self._worlds.rows_of(running)]
+        self._seed, self._over = self._seed[running], self._over[running]
+        hit_learner = self._hit_learner[self._episode]
+        self._worlds = self._worlds.alone(running)
+        self._worlds.hit_learner[:] = hit_learner
+
+    def team(self) -> NDArray[np.void]:
+        """TEAM_DTYPE `[episodes]`; empty where one robot of a world learns."""
+        if self._per_world == 1:
+            return NO_TEAM
+        team = np.zeros(self.num_episodes, TEAM_DTYPE)
+        team["learners"] = self._per_world
+        team["segregation"] = np.repeat(self._segregation / np.maximum(self._decisions, 1), self._per_world)
+        team["hit_learner"] = self._hit_learner
+        return team
 
     def close(self) -> None:
         pass
@@ -199,6 +227,7 @@ class _GymEpisodes:
 
     def __init__(self, spec: EnvSpec, seeds: list[int]) -> None:
         self._env = make_vector_env(spec, len(seeds))
+        self.num_episodes = len(seeds)
         self._env_id = spec.env_id
         self._seeds = seeds
         self._steps = np.zeros(len(seeds), np.int32)
@@ -218,14 +247,17 @@ class _GymEpisodes:
             )
         return _Step(observation, reward, terminated | truncated, self._outcome, self._steps)
 
+    def team(self) -> NDArray[np.void]:
+        return NO_TEAM
+
     def close(self) -> None:
         self._env.close()
 
 
 def _play(spec: EnvSpec, rule: ActionRule, seeds: list[int]) -> EpisodeStats:
-    count = len(seeds)
-    stats = EpisodeStats(np.full(count, NO_OUTCOME, np.int8), np.zeros(count, np.int32), np.zeros(count))
     episodes = _SwarmEpisodes(spec.world, seeds) if spec.is_swarm else _GymEpisodes(spec, seeds)
+    count = episodes.num_episodes
+    stats = EpisodeStats(np.full(count, NO_OUTCOME, np.int8), np.zeros(count, np.int32), np.zeros(count))
     observation = episodes.start()
     running = np.ones(count, np.bool_)
     while running.any():
@@ -234,13 +266,17 @@ def _play(spec: EnvSpec, rule: ActionRule, seeds: list[int]) -> EpisodeStats:
         ended = running & done
         stats.outcome[ended], stats.length_steps[ended] = outcome[ended], steps[ended]
         running &= ~ended
+    team = episodes.team()
     episodes.close()
-    return stats
+    return stats._replace(team=team)
 
 
-def record_episode(spec: EnvSpec, candidate: Candidate, seed: int) -> Episode:
-    """Plays one episode of the swarm environment and records the state after every simulator step."""
-    recording, rule = Recording(spec.world, seed), make_action_rule(spec, candidate, [seed])
+def record_episode(spec: EnvSpec, candidate: Candidate, seed: int, number: int | None = None) -> Episode:
+    """Plays one episode of the swarm environment and records the state after every simulator step.
+
+    Where several robots of the world learn, it is that of the learning robot `number` (see Recording).
+    """
+    recording, rule = Recording(spec.world, seed, number), make_action_rule(spec, candidate, [seed])
     while recording.outcome == Outcome.RUNNING:
         recording.step(rule.act(recording.observation))
     return recording.episode()

@@ -20,15 +20,18 @@ class Recording:
     Args:
       config: the world.
       seed: of the episode.
+      number: where several robots of the world learn, the one whose episode it is, which is the learning robot of the
+        record; by default the seed modulo their number.
 
     Attributes:
-      observation: `[1, *shape]`, what a policy sees now.
+      observation: `[learners, *shape]`, what a policy sees now.
       outcome: RUNNING until the episode ends.
     """
 
-    def __init__(self, config: WorldConfig, seed: int) -> None:
+    def __init__(self, config: WorldConfig, seed: int, number: int | None = None) -> None:
         self._config, self._seed = config, seed
         self._worlds = WorldBatch(config, 1)
+        self._row = seed % self._worlds.num_rows if number is None else number
         self._worlds.seed([seed])
         self.observation: NDArray[Any] = self._worlds.reset()
         self.outcome = Outcome.RUNNING
@@ -48,16 +51,18 @@ class Recording:
 
         It lasts `decision_interval_steps` simulator steps, or as many as the episode has left.
         """
-        taken = int(action[0]) if isinstance(action, np.ndarray) else _driver(action)
+        taken, row = int(action[self._row]) if isinstance(action, np.ndarray) else _driver(action), self._row
 
         def keep() -> None:
+            if self.outcome != Outcome.RUNNING:
+                return  # other learning robots of the world go on
             self._actions.append(taken)
-            self._rewards.append(float(self._worlds.step_reward[0]))
-            self._rows["asked"].append(self._worlds.asked[:, 0].copy())
+            self._rewards.append(float(self._worlds.step_reward[row]))
+            self._rows["asked"].append(self._worlds.asked[:, row].copy())
             self._keep_state()
+            self.outcome = Outcome(self._worlds.outcome[row])
 
-        result = self._worlds.step(action, keep)
-        self.observation, self.outcome = result.observation, Outcome(result.outcome[0])
+        self.observation = self._worlds.step(action, keep).observation
         return self.outcome
 
     def _keep_state(self) -> None:
@@ -65,7 +70,7 @@ class Recording:
         rows["position"].append(self._worlds.positions()[0])
         rows["velocity"].append(np.stack([state.vel_x[0], state.vel_y[0]], axis=-1))
         rows["machine"].append(state.machine[0].copy())
-        rows["sensed"].append(self._worlds.sensed_positions()[0])
+        rows["sensed"].append(self._worlds.sensed_positions()[self._row])
 
     def episode(self, first: int = 0) -> Episode:
         """The states after the first `first` simulator steps, and what was done in them; of all steps by default."""
@@ -79,7 +84,7 @@ class Recording:
             action=np.array([*self._actions[first:], NO_ACTION], np.int64),
             reward=np.array([*self._rewards[first:], 0.0], np.float32),
             goal=self._worlds.goals()[0],
-            learner=int(self._worlds.state.learner[0]),
+            learner=int(self._worlds.state.learner[self._row]),
             outcome=int(self.outcome),
             seed=self._seed,
         )

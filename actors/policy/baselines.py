@@ -103,8 +103,9 @@ class RandomRule:
 
     def __init__(self, config: WorldConfig, seeds: list[int]) -> None:
         streams = [np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0]) for seed in seeds]
-        draws = [stream.integers(config.num_actions, size=config.horizon_steps) for stream in streams]
-        self._actions = iter(np.stack(draws, axis=1))  # [horizon_steps, batch]
+        shape = config.num_learners, config.horizon_steps
+        draws = [stream.integers(config.num_actions, size=shape) for stream in streams]
+        self._actions = iter(np.concatenate(draws).T)  # [horizon_steps, batch]
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.int64]:
         """Actions `[batch]` of the next env step."""

@@ -29,6 +29,7 @@ class JoinedVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDAr
         self._parts = parts
         self._ends = np.cumsum([part.num_envs for part in parts])[:-1]
         self.num_envs = sum(part.num_envs for part in parts)
+        self.num_worlds = sum(part.num_worlds for part in parts)
         self.single_observation_space = parts[0].single_observation_space
         self.single_action_space = parts[0].single_action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -37,21 +38,22 @@ class JoinedVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDAr
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Starts episodes as `SwarmVectorEnv.reset` does (see there for errors)."""
-        seeds, mask = env_seeds(seed, self.num_envs), reset_mask(options, self.num_envs)
-        masks = np.split(np.ones(self.num_envs, np.bool_) if mask is None else mask, self._ends)
+        """Starts episodes as `SwarmVectorEnv.reset` does (see there for errors); a seed and a mask's entry a world."""
+        seeds, mask = env_seeds(seed, self.num_worlds), reset_mask(options, self.num_worlds)
+        ends = np.cumsum([part.num_worlds for part in self._parts])[:-1]
+        masks = np.split(np.ones(self.num_worlds, np.bool_) if mask is None else mask, ends)
         seen, begin = [], 0
         for part, own in zip(self._parts, masks, strict=True):
-            given = seeds[begin : begin + part.num_envs]
+            given = seeds[begin : begin + part.num_worlds]
             starts = part.reset(seed=given, options={RESET_MASK: own})[0] if own.any() else part.worlds.observation()
             seen.append(starts)
-            begin += part.num_envs
+            begin += part.num_worlds
         return np.concatenate(seen), {}
 
     def step(
         self, actions: NDArray[np.int64]
     ) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """One env step of every world; `actions` `[num_envs]`.
+        """One env step of every row; `actions` `[num_envs]`.
 
         Raises:
           ValueError: an action is none of the action space.
@@ -63,20 +65,27 @@ class JoinedVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDAr
         return observation, reward, terminated, truncated, self._joined_infos(steps, infos)
 
     def _joined_infos(self, steps: list[Any], infos: tuple[dict[str, Any], ...]) -> dict[str, Any]:
-        """What the parts tell of ended episodes; a part without any adds rows that its masks leave out."""
-        if not any(infos):
-            return {}
+        """What the parts tell of decisions and ended episodes; one without any adds rows that its masks leave out."""
+        joined: dict[str, Any] = {}
+        if any("decided" in info for info in infos):
+            everybody = [np.ones(part.num_envs, np.bool_) for part in self._parts]
+            decided = [info.get("decided", all_of) for info, all_of in zip(infos, everybody, strict=True)]
+            joined["decided"] = np.concatenate(decided)
+        ends = [info.get("final_info") for info in infos]
+        example = next((end for end in ends if end), None)
+        if example is None:
+            return joined
         final: Arrays = {}
-        for name, column in next(info for info in infos if info)["final_info"].items():
+        for name, column in example.items():
             final[name] = np.concatenate(
                 [
-                    info["final_info"][name] if info else np.zeros(part.num_envs, column.dtype)
-                    for part, info in zip(self._parts, infos, strict=True)
+                    end[name] if end else np.zeros(part.num_envs, column.dtype)
+                    for part, end in zip(self._parts, ends, strict=True)
                 ]
             )
         ended = final["_outcome"]
-        observations = [info["final_obs"] if info else step[0] for step, info in zip(steps, infos, strict=True)]
-        return {
+        observations = [info.get("final_obs", step[0]) for step, info in zip(steps, infos, strict=True)]
+        return joined | {
             "final_obs": np.concatenate(observations),
             "_final_obs": ended,
             "final_info": final,

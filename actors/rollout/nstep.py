@@ -21,6 +21,7 @@ class Steps(NamedTuple):
     next_observation: observation after the step; an episode's last one where `done`.
     terminated: where the task terminated.
     done: where the episode ended, terminated or truncated.
+    decided: where there was a step; a learning robot whose episode has ended makes none until its world restarts.
     """
 
     observation: NDArray[Any]
@@ -29,6 +30,7 @@ class Steps(NamedTuple):
     next_observation: NDArray[Any]
     terminated: NDArray[np.bool_]
     done: NDArray[np.bool_]
+    decided: NDArray[np.bool_]
 
 
 def _pairs(a: Steps, b: Steps) -> Iterable[tuple[NDArray[Any], NDArray[Any]]]:
@@ -46,11 +48,14 @@ def empty_steps(steps: int, num_envs: int, dtype: np.dtype[Any]) -> Steps:
         next_observation=np.zeros(shape, observation.base),
         terminated=np.zeros((steps, num_envs), np.bool_),
         done=np.zeros((steps, num_envs), np.bool_),
+        decided=np.ones((steps, num_envs), np.bool_),
     )
 
 
 class NStepAssembler:
     """Turns env steps into n-step transitions, which are shorter where an episode ends.
+
+    Each environment, or learning robot of one, has a chain of transitions of its own.
 
     The last `n_step - 1` steps are kept. Those without `n_step` rewards are pending: the next block completes them.
 
@@ -77,6 +82,7 @@ class NStepAssembler:
         for kept, array in _pairs(self._kept, window):
             kept[...] = array[len(array) - len(kept) :]
         self._kept.done[:] = False  # pending steps belong to running episodes; the others are not used again
+        self._kept.decided[:] = True
         return packed
 
     def _complete(self, window: Steps) -> tuple[Packed, NDArray[np.bool_]]:
@@ -119,6 +125,7 @@ class _Columns(NamedTuple):
     reward: NDArray[np.float64]
     terminated: NDArray[np.bool_]
     done: NDArray[np.bool_]
+    decided: NDArray[np.bool_]
 
 
 class _RowIndex(NamedTuple):
@@ -159,7 +166,7 @@ def _assemble(
     kept, count = len(pending), 0
     for step in range(total):
         for env in range(num_envs):
-            if step < kept and not was_pending[step, env]:
+            if not steps.decided[step, env] or (step < kept and not was_pending[step, env]):
                 continue
             value, last, ended = _n_step_return(steps, powers, step, env)
             if not ended and step >= total - kept:

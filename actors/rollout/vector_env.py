@@ -20,6 +20,8 @@ from sim_core.worlds import rehearse
 def make_vector_env(spec: EnvSpec, num_envs: int) -> gym.vector.VectorEnv[Any, Any, Any]:
     """Makes `num_envs` environments that restart in the step that ends an episode (`AutoresetMode.SAME_STEP`).
 
+    Where several robots of a world learn, an environment is a learning robot, and the number `EnvSpec.counts`.
+
     Raises:
       ConfigError: see ForeignVectorEnv, which holds all environments that are not ours.
     """
@@ -27,26 +29,21 @@ def make_vector_env(spec: EnvSpec, num_envs: int) -> gym.vector.VectorEnv[Any, A
         return JoinedVectorEnv(
             [
                 SwarmVectorEnv(count, **dataclasses.asdict(world))
-                for (world, _), count in zip(spec.shares, _counts(spec, num_envs), strict=True)
+                for world, count in zip(spec.worlds, spec.counts(num_envs), strict=True)
             ]
         )
     if spec.is_swarm:
-        return gym.make_vec(ENV_ID, num_envs=num_envs, **spec.settings)
+        return gym.make_vec(ENV_ID, num_envs=spec.counts(num_envs)[0], **spec.settings)
     return ForeignVectorEnv(spec.env_id, num_envs)
 
 
-def _counts(spec: EnvSpec, num_envs: int) -> list[int]:
-    """Environments of every setup: at least one each, the rest in proportion to the shares (largest remainder)."""
-    shares = np.array([share for _, share in spec.shares])
-    quotas = shares / shares.sum() * (num_envs - len(shares))
-    counts = np.floor(quotas).astype(int)
-    most_left = np.argsort(counts - quotas, kind="stable")[: num_envs - len(shares) - counts.sum()]
-    counts[most_left] += 1
-    return [int(count) + 1 for count in counts]
+def num_worlds_of(env: gym.vector.VectorEnv[Any, Any, Any]) -> int:
+    """Environments that have a seed each: worlds, of which a learning robot is a row."""
+    return env.num_worlds if isinstance(env, SwarmVectorEnv | JoinedVectorEnv) else env.num_envs
 
 
 def reset_seeded(env: gym.vector.VectorEnv[Any, Any, Any], seeds: list[int]) -> NDArray[Any]:
-    """Resets environment i with `seeds[i]`; returns the first observations `[num_envs, ...]`."""
+    """Resets world i with `seeds[i]` (`num_worlds_of`); returns the first observations `[num_envs, ...]`."""
     observation: NDArray[Any] = env.reset(seed=seeds)[0]  # type: ignore[arg-type]  # every VectorEnv takes a list
     return observation
 
@@ -81,7 +78,7 @@ def env_shape(spec: EnvSpec) -> EnvShape:
         return EnvShape(observations, int(actions.n))
     for world in spec.worlds:
         rehearse(world)
-    env = make_vector_env(spec, len(spec.worlds))
+    env = make_vector_env(spec, sum(spec.learners()))
     try:
         return spaces_of(env)
     finally:

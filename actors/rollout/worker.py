@@ -12,7 +12,7 @@ from actors.rollout.env_spec import EnvSpec
 from actors.rollout.exploration import draw_random_actions, explore
 from actors.rollout.joined_env import JoinedVectorEnv
 from actors.rollout.nstep import NStepAssembler, Steps, empty_steps
-from actors.rollout.vector_env import final_observations, make_vector_env, reset_seeded, spaces_of
+from actors.rollout.vector_env import final_observations, make_vector_env, num_worlds_of, reset_seeded, spaces_of
 from actors.service.messages import (
     NO_OUTCOME,
     SCHEMA_VERSION,
@@ -40,6 +40,10 @@ class RolloutSettings(NamedTuple):
 class RolloutWorker:
     """Steps `num_envs` environments; one `collect` makes one block of `num_envs * steps_per_block` env steps.
 
+    Where several robots of a world learn, an environment is a learning robot (`EnvSpec.counts`). It has an n-step chain
+    and episodes of its own, and it makes no step from its episode's end until its world restarts: an env step is a
+    decision of a learning robot.
+
     Args:
       settings: see RolloutSettings.
       worker_id: index among the workers.
@@ -55,14 +59,15 @@ class RolloutWorker:
         self._env = make_vector_env(settings.env, settings.num_envs)
         shape = spaces_of(self._env)
         self._num_actions = shape.num_actions
+        self._num_envs = num_envs = self._env.num_envs
         self._dtype = packed_dtype(transition_dtype(shape.observation_space))
         seeds = np.random.SeedSequence((settings.seed, worker_id, incarnation))
         env_seeds, policy_seed = seeds.spawn(2)
         self._rng = np.random.Generator(np.random.PCG64(policy_seed))
-        self._nstep = NStepAssembler(self._dtype, settings.num_envs, settings.n_step, settings.discount)
-        self._length = np.zeros(settings.num_envs, np.int32)
-        self._return = np.zeros(settings.num_envs, np.float64)
-        words = env_seeds.generate_state(settings.num_envs) // 2  # Gymnasium takes 31 bits
+        self._nstep = NStepAssembler(self._dtype, num_envs, settings.n_step, settings.discount)
+        self._length = np.zeros(num_envs, np.int32)
+        self._return = np.zeros(num_envs, np.float64)
+        words = env_seeds.generate_state(num_worlds_of(self._env)) // 2  # Gymnasium takes 31 bits
         self._observation = reset_seeded(self._env, [int(word) for word in words])
         self._policy: Policy | None = None
 
@@ -85,8 +90,8 @@ class RolloutWorker:
         if self._policy is None:
             raise RuntimeError("a rollout worker needs weights before it collects")
         count = self._settings.steps_per_block
-        steps = empty_steps(count, self._settings.num_envs, self._dtype)
-        shape = (count, self._settings.num_envs)
+        steps = empty_steps(count, self._num_envs, self._dtype)
+        shape = (count, self._num_envs)
         random_actions = draw_random_actions(shape, epsilon, self._num_actions, self._rng)
         ended = EpisodeStats(np.zeros(shape, np.int8), np.zeros(shape, np.int32), np.zeros(shape))
         for i in range(count):
@@ -104,7 +109,7 @@ class RolloutWorker:
             policy_version=weights.version,
             policy_time_s=weights.time_s,
             epsilon=epsilon,
-            env_steps=count * self._settings.num_envs,
+            env_steps=int(np.count_nonzero(steps.decided)),
             made=self._made,
         )
         self._sequence += 1
@@ -126,6 +131,7 @@ class RolloutWorker:
         steps.observation[i], steps.action[i], steps.reward[i] = self._observation, action, reward
         steps.next_observation[i] = final_observations(observation, done, infos)
         steps.terminated[i], steps.done[i] = terminated, done
+        steps.decided[i] = infos.get("decided", True)
         self._observation = observation
         self._length += 1
         self._return += reward
@@ -185,5 +191,5 @@ def join_stats(stats: list[EpisodeStats]) -> EpisodeStats:
 
 def select_stats(stats: EpisodeStats, rows: NDArray[Any] | slice) -> EpisodeStats:
     """The episodes of `rows`: a mask, indices or a slice."""
-    outcome, length_steps, episode_return = stats
-    return EpisodeStats(outcome[rows], length_steps[rows], episode_return[rows])
+    outcome, length_steps, episode_return, team = stats
+    return EpisodeStats(outcome[rows], length_steps[rows], episode_return[rows], team[rows] if len(team) else team)

@@ -20,15 +20,24 @@ NO_OUTCOME = -1
 """Outcome of an episode whose environment reports none."""
 
 
+TEAM_DTYPE = np.dtype([("learners", np.int32), ("segregation", np.float32), ("hit_learner", np.bool_)])
+"""What an evaluation knows of a learning robot's world: how many robots of it learn, the mean share of the pairs of
+groups that were segregated (Eq. 3.1), and whether this robot's episode ended in a collision with one that learns."""
+NO_TEAM = np.zeros(0, TEAM_DTYPE)
+
+
 class EpisodeStats(NamedTuple):
     """Statistics of finished episodes `[episodes]`: outcome, length, and undiscounted return.
 
-    The length counts simulator steps in the swarm environment, env steps in others.
+    The length counts simulator steps in the swarm environment, env steps in others. Where several robots of a world
+    learn, each has an episode, and those of a world stand together; `team` `[episodes]` TEAM_DTYPE tells of their world
+    in an evaluation, and is empty otherwise.
     """
 
     outcome: NDArray[np.int8]
     length_steps: NDArray[np.int32]
     episode_return: NDArray[np.float64]
+    team: NDArray[np.void] = NO_TEAM
 
 
 class BlockHeader(NamedTuple):

@@ -38,7 +38,8 @@ def first_episode(world: WorldConfig, rule: Baseline, outcome: Outcome) -> Episo
         seeds = list(range(begin, begin + AT_ONCE))
         found = np.flatnonzero(evaluate(spec, rule, seeds).outcome == outcome)
         if len(found):
-            return record_episode(spec, rule, seeds[found[0]])
+            seed, learner = divmod(int(found[0]), world.num_learners)
+            return record_episode(spec, rule, seeds[seed], learner)
     return None
 
 

@@ -92,6 +92,8 @@ def player_data(episode: Episode, config: WorldConfig) -> dict[str, Any]:
       ValueError: the positions are not finite, or not those of `config.num_robots` robots.
     """
     position = np.asarray(episode.position, np.float64)
+    if config.num_learners > 1 and config.ended_learners == "leave":  # out of sight
+        position = np.where(np.isnan(position), 2 * view_half_m(config), position)
     if position.ndim != 3 or position.shape[1:] != (config.num_robots, 2) or not np.isfinite(position).all():
         raise ValueError(
             f"an episode of {config.setup} has finite positions [T + 1, {config.num_robots}, 2]; "

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from actors.evaluation.conditions import parse_condition
-from actors.evaluation.evaluation_store import StoredEvaluation, refuse_existing, save_evaluation
+from actors.evaluation.evaluation_store import StoredEvaluation, entry_seeds, refuse_existing, save_evaluation
 from actors.evaluation.evaluator import record_episode
 from actors.evaluation.trajectory import save_episodes
 from actors.policy.baselines import Baseline
@@ -56,7 +56,7 @@ def run(command: Evaluate) -> int:
     plain_console().print(evaluation_table(summarise(stats), target.title, kind))
     if command.out is not None:
         _record(command.out, target, seeds[: command.record])
-        seed = np.array(seeds, np.int64)
+        seed = entry_seeds(seeds, stats)
         save_evaluation(command.out, StoredEvaluation(target.spec, target.name, target.updates, seed, stats))
         plain_console().print(str(command.out), soft_wrap=True)
     return 0

@@ -16,7 +16,10 @@ from sim_core.outcomes import Outcome
 
 
 def evaluation_table(evaluation: Evaluation, title: str, kind: str = "greedy episodes") -> Table:
-    """The rate of every outcome, the mean return and the mean length of episodes, with 95 % intervals."""
+    """The rate of every outcome, the mean return and the mean length of episodes, with 95 % intervals.
+
+    Of worlds in which several robots learn, also what they do together.
+    """
     table = Table(title=f"{title}: {evaluation.episodes} {kind}", title_justify="left")
     table.add_column("result")
     table.add_column("value", justify="right")
@@ -25,6 +28,15 @@ def evaluation_table(evaluation: Evaluation, title: str, kind: str = "greedy epi
         table.add_row(outcome_label(outcome).replace("_", " "), *percent(estimate))
     table.add_row("mean return", *_plain(evaluation.episode_return, 2))
     table.add_row("mean episode length (steps)", *_plain(evaluation.episode_length, 1))
+    team = evaluation.team
+    if team is not None:
+        table.add_section()
+        table.add_row("worlds", f"{team.worlds}", "")
+        table.add_row("all arrive", *percent(team.all_arrive))
+        if team.last_arrival_steps is not None:
+            table.add_row("last arrival (steps)", *_plain(team.last_arrival_steps, 1))
+        table.add_row("segregated along the way", *percent(team.segregation))
+        table.add_row("collision of two learners", *percent(team.learner_collisions))
     return table
 
 

@@ -47,6 +47,9 @@ class Players:
     """Robots per group; by default those of the training, or 10 for a baseline. Others test Extrapolation."""
     groups: int | None = None
     """Groups; by default those of the training, or 2 for a baseline. Others test Extrapolation."""
+    learners: str | None = None
+    """Learning robots of a world, as of `shoal train`: one, a count or a share of every group; by default those of the
+    training, or one for a baseline."""
     checkpoint: str = "newest"
     """The policy's checkpoint: newest, best (by the evaluations during training), or a name (step-…)."""
     runs_dir: Path = Path("runs")

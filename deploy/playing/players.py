@@ -18,8 +18,8 @@ from sim_core.checks import require
 from sim_core.config import WorldConfig
 from sim_core.plugins import SCENES
 
-SCENE_SETTINGS = ("scene", "arena_radius_m", "start_spacing_m", "start_jitter_m")
-"""World settings, beside robots and groups, that decide where episodes start."""
+SCENE_SETTINGS = ("scene", "arena_radius_m", "start_spacing_m", "start_jitter_m", "learners")
+"""World settings, beside robots and groups, that decide where episodes start, and whose they are."""
 
 
 class Target(NamedTuple):
@@ -78,8 +78,8 @@ def check_same_starts(targets: list[Target]) -> None:
         require(target.spec.is_swarm, f"{target.name} plays {target.spec.env_id}, whose episodes have no outcomes")
         require(
             _start_scenes(target.spec) == _start_scenes(first.spec),
-            f"the episodes of {target.name} and {first.name} do not start alike: their setups or scenes differ; name "
-            "one setup for all with --robots and --groups",
+            f"the episodes of {target.name} and {first.name} do not start alike: their setups, scenes or learning "
+            "robots differ; name one setup for all with --robots, --groups and --learners",
         )
 
 
@@ -99,20 +99,23 @@ def _trained(command: Players, run: str) -> Target:
         )
     folder = find_run(run, command.runs_dir)
     config = folder.config()
+    resized = command.robots is not None or command.groups is not None
     require(
-        config.env.is_swarm or (command.robots is None and command.groups is None),
-        f"--robots and --groups apply to our own environment, not to {config.env_id}",
+        config.env.is_swarm or (not resized and command.learners is None),
+        f"--robots, --groups and --learners apply to our own environment, not to {config.env_id}",
     )
-    if command.robots is not None or command.groups is not None:
-        config = dataclasses.replace(config, world=_resized(config.world, command), setups=())
+    if resized or command.learners is not None:
+        setups = () if resized else config.setups
+        config = dataclasses.replace(config, world=_resized(config.world, command), setups=setups)
     weights = find_policy(folder, config, command.checkpoint)
     return Target(config.env, weights, folder.path.name, weights.version, config.title, folder)
 
 
 def _resized(world: WorldConfig, command: Players) -> WorldConfig:
-    """The world with the robots and groups that the command asks for."""
+    """The world with the robots, groups and learning robots that the command asks for."""
     return dataclasses.replace(
         world,
         robots=world.robots if command.robots is None else command.robots,
         groups=world.groups if command.groups is None else command.groups,
+        learners=world.learners if command.learners is None else command.learners,
     )

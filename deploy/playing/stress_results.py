@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.evaluation.conditions import Axis, Condition, along, world_under
-from actors.evaluation.evaluation_store import StoredEvaluation, load_evaluation, save_evaluation
+from actors.evaluation.evaluation_store import StoredEvaluation, entry_seeds, load_evaluation, save_evaluation
 from actors.evaluation.statistics import Estimate, rate
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.env_spec import EnvSpec
@@ -97,7 +97,7 @@ class StressResults:
 
     def save(self, cell: StressCell, stats: EpisodeStats) -> None:
         """Stores a cell's episodes, which appear once they are complete."""
-        seed = np.array(self._seeds, np.int64)
+        seed = entry_seeds(self._seeds, stats)
         stored = StoredEvaluation(cell.spec, cell.target.name, cell.target.updates, seed, stats)
         save_evaluation(self._folder / f"{self._key(cell)}.zarr", stored)
 

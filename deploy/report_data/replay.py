@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from actors.evaluation.evaluation_store import load_evaluation
 from actors.evaluation.evaluator import Candidate, record_episode
 from actors.evaluation.result_table import LEARNED, ResultRow
@@ -32,8 +34,9 @@ def replay(folder: RunFolder, row: ResultRow, outcome: str, number: int) -> dict
     if outcome not in OUTCOME_NAMES:
         raise LookupError(f"outcome {outcome!r}")
     stored = load_evaluation(folder.path / EVALUATIONS / f"{row.robots}r{row.groups}g.zarr")
-    seeds = stored.seed[stored.stats.outcome == OUTCOME_NAMES.index(outcome)]
-    episode = record_episode(stored.spec, _candidate(folder, row), int(nth(seeds, number)))
+    entries = np.flatnonzero(stored.stats.outcome == OUTCOME_NAMES.index(outcome)).tolist()
+    entry, learners = nth(entries, number), stored.spec.world.num_learners
+    episode = record_episode(stored.spec, _candidate(folder, row), int(stored.seed[entry]), entry % learners)
     return player_data(episode, stored.spec.world)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from actors.evaluation.evaluator import evaluate, record_episode
 from actors.policy.policy import WeightsSnapshot
 from dashboards.pages.player import player_data
@@ -31,7 +33,7 @@ class RunEpisodes:
         self._spec = self._config.env.of_setup(self._config.world)  # of several setups, the run's own
         self._policy = NewestPolicy(folder, self._config)
         self._weights: WeightsSnapshot | None = None
-        self._seeds: dict[str, list[int]] = {}
+        self._entries: dict[str, list[int]] = {}
 
     def groups(self) -> list[EpisodeGroup]:
         """One group, or none while the run has no policy."""
@@ -40,24 +42,21 @@ class RunEpisodes:
         except ConfigError:
             return []
         if weights is not self._weights:
-            self._weights, self._seeds = weights, self._play(weights)
-        world, counts = self._config.world, {name: len(seeds) for name, seeds in self._seeds.items()}
+            self._weights, self._entries = weights, self._play(weights)
+        world, counts = self._config.world, {name: len(entries) for name, entries in self._entries.items()}
         policy, seed = f"of update {weights.version:,}", str(self._config.seed)
         return [EpisodeGroup(KEY, "", policy, world.method_name, world.setup, seed, world.setup, counts)]
 
     def _play(self, weights: WeightsSnapshot) -> dict[str, list[int]]:
-        """Plays the episodes; their seeds by outcome."""
+        """Plays the episodes; their places in the evaluation by outcome."""
         first = self._config.final_eval_first_seed
-        seeds = list(range(first, first + EPISODES))
-        outcomes = evaluate(self._spec, weights, seeds).outcome
-        return {
-            outcome.name.lower(): [seed for seed, end in zip(seeds, outcomes, strict=True) if end == outcome]
-            for outcome in ENDED
-        }
+        outcomes = evaluate(self._spec, weights, list(range(first, first + EPISODES))).outcome
+        return {outcome.name.lower(): np.flatnonzero(outcomes == outcome).tolist() for outcome in ENDED}
 
     def episode(self, key: str, outcome: str, number: int) -> dict[str, Any]:
         """Plays the episode."""
         if key != KEY or self._weights is None:
             raise LookupError(f"group {key!r}")
-        seed = nth(self._seeds.get(outcome, []), number)
-        return player_data(record_episode(self._spec, self._weights, seed), self._config.world)
+        seed, learner = divmod(nth(self._entries.get(outcome, []), number), self._spec.world.num_learners)
+        seed += self._config.final_eval_first_seed
+        return player_data(record_episode(self._spec, self._weights, seed, learner), self._config.world)

@@ -6,6 +6,7 @@ policy that rollout workers act with, and the simulator's velocity.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from actors.rollout.env_spec import EnvSpec
 from actors.rollout.vector_env import make_vector_env, reset_seeded
 from learner.export.robot_module import NO_DECISION, RobotModule, robot_class
 from sim_core import ENV_ID
-from sim_core.config import WorldConfig
+from sim_core.config import ONE_LEARNER, WorldConfig
 from sim_core.worlds import WorldBatch, is_done
 
 MAX_WORLDS = 100
@@ -47,6 +48,7 @@ def swarm_states(config: WorldConfig, driver: Candidate, weights: WeightsSnapsho
       Inputs of the module of `config.method`, and the simulator's `velocity`, `action`, `action_values` and
       `observation`.
     """
+    config = replace(config, learners=ONE_LEARNER)  # the policy of a robot is the same, whatever others do
     size = min(MAX_WORLDS, count)
     seeds = list(range(seed, seed + size))
     worlds, policy = WorldBatch(config, size), Policy(weights)
@@ -92,7 +94,7 @@ def observed_states(spec: EnvSpec, weights: WeightsSnapshot, seed: int, count: i
       `observation` as the environment gives it; expected `action` and `action_values`.
     """
     size = min(MAX_WORLDS, count)
-    policy = Policy(weights)
+    spec, policy = spec.with_one_learner(), Policy(weights)
     env = make_vector_env(spec, size)
     observation, taken = reset_seeded(env, list(range(seed, seed + size))), list[Sensed]()
     for _ in range(-(-count // size)):

@@ -26,6 +26,8 @@ _MONITORING_ONLY = (
     "train/td_error",
     "train/episode_length",
     "eval/episode_length",
+    "eval/last_arrival_steps",
+    "eval/learner_collision_rate",
     "time/worker_acts",
     "time/learner_updates",
     "time/learner_publishes",

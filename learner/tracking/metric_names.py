@@ -75,6 +75,8 @@ def _evaluated() -> tuple[MetricSpec, ...]:
         "captured": ("greedy episodes in which the robot was captured", "falls"),
         "collision": ("greedy episodes that ended in a collision", "falls"),
         "timeout": ("greedy episodes that ended at the horizon", "falls"),
+        "all_arrive": ("worlds in which every learning robot reached its goal, where several learn", "rises"),
+        "learner_collision": ("episodes that ended in a collision of two learning robots, likewise", "falls"),
     }
     rows = []
     for name, (meaning, healthy) in rates.items():
@@ -90,7 +92,11 @@ def _evaluated() -> tuple[MetricSpec, ...]:
     ]
     meaning = "mean length of the greedy episodes"
     length = _gauge("eval/episode_length", "eval_episode_length", "steps", meaning, "below the horizon")
-    return (*rows, length)
+    meaning = "mean time of the last arrival in worlds where all arrive, where several robots learn"
+    last = _gauge("eval/last_arrival_steps", "eval_last_arrival_steps", "steps", meaning, "falls")
+    meaning = "pairs of groups that were segregated along the way (Eq. 3.1), where several robots learn"
+    segregation = _gauge("eval/segregation", "eval_segregation", "share", meaning, "near 1")
+    return (*rows, length, last, segregation)
 
 
 EVALUATION = _evaluated()

@@ -151,6 +151,7 @@ class Tracker:
             "method": config.world.method_name if config.env.is_swarm else "none",
             "robots": _only({world.robots for world in config.env.worlds}),
             "groups": _only({world.groups for world in config.env.worlds}),
+            "learners": config.world.learners if config.env.is_swarm else "none",
             "seed": str(config.seed),
             "engine": config.engine,
             "config_hash": config_hash(config),

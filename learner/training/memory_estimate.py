@@ -35,12 +35,13 @@ def bytes_by_setting(config: RunConfig, shape: EnvShape) -> dict[str, int]:
     widths = [shape.observation_size, *config.policy_sizes, shape.num_actions]
     weights = sum(inputs * outputs + outputs for inputs, outputs in itertools.pairwise(widths))
     robots = max(world.num_robots for world in config.env.worlds) if config.env.is_swarm else 1
+    rows = sum(config.env.counts(config.envs_per_worker))
     actors = config.workers + (config.replay_shards if config.replay_placement == "actors" else 0)
     return {
-        "workers, envs_per_worker and robots": config.workers * config.envs_per_worker * robots * ROBOT_BYTES,
+        "workers, envs_per_worker and robots": config.workers * rows * robots * ROBOT_BYTES,
         "workers and replay_shards": actors * PROCESS_BYTES if config.engine == "ray" else 0,
         "envs_per_worker, steps_per_block and n_step": config.workers
-        * config.envs_per_worker
+        * rows
         * (config.steps_per_block + config.n_step)
         * row,
         "replay_capacity": config.replay_capacity * (packed + priority)

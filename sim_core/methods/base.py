@@ -21,7 +21,7 @@ from sim_core.methods.progress import came_closer
 from sim_core.outcomes import Outcome
 from sim_core.packed import packed
 from sim_core.plugins import guarded, refuse
-from sim_core.state import WorldState, own_group
+from sim_core.state import WorldState, own_group, world_of
 
 _GOAL, _RUNNING, _TIMEOUT = int(Outcome.GOAL), int(Outcome.RUNNING), int(Outcome.TIMEOUT)
 
@@ -75,12 +75,13 @@ def episode_params(config: WorldConfig) -> EpisodeParams:
 @kernel
 def _outcome(state, mask, out, params):
     p = params[0]
-    for world in range(out.shape[0]):
-        if not mask[world]:
+    for row in range(out.shape[0]):
+        if not mask[row]:
             continue
-        group, begin, end = own_group(state, world)
+        world = world_of(state, row)
+        group, begin, end = own_group(state, row)
         ended = end_of_step(
-            state.learner[world],
+            state.learner[row],
             begin,
             end,
             state.pos_x[world],
@@ -94,27 +95,31 @@ def _outcome(state, mask, out, params):
         )
         if ended == _RUNNING and state.steps[world] >= p.horizon_steps:
             ended = _TIMEOUT
-        out[world] = ended
+        out[row] = ended
 
 
 @kernel
 def _reward(state, mask, outcome, out, params):
     p = params[0]
-    for world in range(out.shape[0]):
-        if not mask[world]:
+    for row in range(out.shape[0]):
+        if not mask[row]:
             continue
-        closer = came_closer(state, world)
-        if outcome[world] == _RUNNING or (outcome[world] == _TIMEOUT and not p.timeout_fails):
-            clock = state.steps[world] if p.clock_is_step else p.horizon_steps
+        closer = came_closer(state, row)
+        if outcome[row] == _RUNNING or (outcome[row] == _TIMEOUT and not p.timeout_fails):
+            clock = state.steps[world_of(state, row)] if p.clock_is_step else p.horizon_steps
             reward = p.reward_scale / clock if closer else -p.reward_scale / clock
         else:
-            reward = p.reward_scale if outcome[world] == _GOAL else -p.reward_scale
-        out[world] = reward
-        state.episode_return[world] += reward
+            reward = p.reward_scale if outcome[row] == _GOAL else -p.reward_scale
+        out[row] = reward
+        state.episode_return[row] += reward
 
 
 class Method:
-    """State representation, velocity, reward and outcome of the learning robot.
+    """State representation, velocity, reward and outcome of the learning robots.
+
+    `num_rows` below counts learning robots, world after world: worlds, where one robot of each learns. A built-in
+    method's kernels find a row's world with `sim_core.state.world_of`; a method of a user's own always gets a state in
+    which every row is a world of its own (see `CheckedMethod`).
 
     Attributes:
       observation_dtype: dtype of an observation; float32 by default.
@@ -189,14 +194,14 @@ class Method:
         return {}
 
     def observe(self, state: WorldState) -> NDArray[Any]:
-        """Observations `[num_worlds, size]` of all worlds, in plain numpy; a method with kernels defines `perceive`.
+        """Observations `[num_rows, size]` of all rows, in plain numpy; a method with kernels defines `perceive`.
 
         `state` is what the learning robots sense (`sim_core.senses`): a robot that is not sensed is at NaN.
         """
         raise NotImplementedError(f"{type(self).__name__} must define observe(self, state)")
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[Any]) -> None:
-        """Writes observations `[num_worlds, *observation_shape]` of the worlds where `mask` is set; see `observe`."""
+        """Writes observations `[num_rows, *observation_shape]` of the rows where `mask` is set; see `observe`."""
         seen = np.asarray(self.observe(state))
         if seen.shape != out.shape:
             raise ValueError(f"observations of shape {seen.shape}, not {out.shape}")
@@ -211,17 +216,17 @@ class Method:
         turn_headings(action, parts, self.config.sectors // self.turns(self.config), self.config.sectors)
 
     def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
-        """Writes the learning robots' velocities `[num_worlds]` (m/s) for `action` `[num_worlds]`: u_nn of Eq. 3.4.
+        """Writes the learning robots' velocities `[num_rows]` (m/s) for `action` `[num_rows]`: u_nn of Eq. 3.4.
 
         `state` is what the learning robots sense.
 
         Raises:
-          ValueError: there is not one action a world, or one is none of the actions.
+          ValueError: there is not one action a row, or one is none of the actions.
         """
         write_headings(self.headings, action, out_x, out_y)
 
     def outcome(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
-        """Writes the Outcome `[num_worlds]` after a simulator step of the worlds where `mask` is set.
+        """Writes the Outcome `[num_rows]` after a simulator step of the rows where `mask` is set.
 
         It is called once a step, so it may count steps.
 
@@ -233,7 +238,7 @@ class Method:
     def reward(
         self, state: WorldState, mask: NDArray[np.bool_], outcome: NDArray[np.int8], out: NDArray[np.float32]
     ) -> None:
-        """Writes the rewards `[num_worlds]` of a simulator step of the worlds where `mask` is set.
+        """Writes the rewards `[num_rows]` of a simulator step of the rows where `mask` is set.
 
         It adds them to `state.episode_return`.
 

@@ -38,7 +38,7 @@ from sim_core.methods.m_sensor import WORLD as SWARM_WORLD
 from sim_core.methods.progress import came_closer
 from sim_core.outcomes import Outcome
 from sim_core.packed import packed
-from sim_core.state import WorldState, own_group
+from sim_core.state import WorldState, own_group, world_of
 
 ELLIPSE_COLUMNS = 7
 """a, b, x_c, y_c, theta, x_g, y_g."""
@@ -68,9 +68,9 @@ class EllipseMethodParams(NamedTuple):
 
 
 @kernel
-def _order_groups(world, state, order, distance_sq, p):
+def _order_groups(world, learner, state, order, distance_sq, p):
     """Fills `order` `[groups]`: the own group, then the others as the settings say; `distance_sq` is scratch."""
-    pos_x, pos_y, learner = state.pos_x[world], state.pos_y[world], state.learner[world]
+    pos_x, pos_y = state.pos_x[world], state.pos_y[world]
     own = state.group[learner]
     order[0] = own
     for place in range(1, p.groups):
@@ -88,9 +88,9 @@ def _order_groups(world, state, order, distance_sq, p):
 
 
 @kernel
-def _write_row(group, world, state, out, at, p):
+def _write_row(group, world, learner, state, out, at, p):
     """Writes one group's row to `out[at:at + columns]`."""
-    pos_x, pos_y, learner = state.pos_x[world], state.pos_y[world], state.learner[world]
+    pos_x, pos_y = state.pos_x[world], state.pos_y[world]
     begin, end = state.group_begin[group], state.group_begin[group + 1]
     a, b, x_c, y_c, theta = group_ellipse(begin, end, pos_x, pos_y, left_out_of(learner, p.ellipse), p.ellipse)
     if x_c != x_c:  # none of its robots is sensed: no ellipse, which no half-axis of 0 can be taken for
@@ -112,30 +112,32 @@ def _write_row(group, world, state, out, at, p):
 @kernel
 def _perceive(state, mask, out, order, distance_sq, params):
     p = params[0]
-    for world in range(mask.shape[0]):
-        if not mask[world]:
+    for row in range(mask.shape[0]):
+        if not mask[row]:
             continue
-        _order_groups(world, state, order, distance_sq, p)
-        for row in range(p.groups):
-            _write_row(order[row], world, state, out[world], row * p.columns, p)
-        out[world, p.groups * p.columns :] = np.float32(0)
+        world, learner = world_of(state, row), state.learner[row]
+        _order_groups(world, learner, state, order, distance_sq, p)
+        for place in range(p.groups):
+            _write_row(order[place], world, learner, state, out[row], place * p.columns, p)
+        out[row, p.groups * p.columns :] = np.float32(0)
 
 
 @kernel
 def _outcome(state, mask, out, params):
     p, e = params[0], params[0].episode
-    for world in range(out.shape[0]):
-        if not mask[world]:
+    for row in range(out.shape[0]):
+        if not mask[row]:
             continue
-        pos_x, pos_y, learner = state.pos_x[world], state.pos_y[world], state.learner[world]
-        group, begin, end = own_group(state, world)
+        world, learner = world_of(state, row), state.learner[row]
+        pos_x, pos_y = state.pos_x[world], state.pos_y[world]
+        group, begin, end = own_group(state, row)
         inside = in_own_ellipse(learner, begin, end, pos_x, pos_y, p.ellipse)
-        state.outside_steps[world] = 0 if inside else state.outside_steps[world] + 1
+        state.outside_steps[row] = 0 if inside else state.outside_steps[row] + 1
         goal_x, goal_y = state.goal_x[world, group], state.goal_y[world, group]
         ended = collision_or_goal(
             learner, begin, end, pos_x, pos_y, goal_x, goal_y, e.collision_sq, e.outer_m, e.of_centroid
         )
-        away = state.outside_steps[world] >= e.outside_limit_steps
+        away = state.outside_steps[row] >= e.outside_limit_steps
         if ended == _RUNNING and e.lost_ends and not away:
             own, _ = sensed(learner, begin, end, pos_x, pos_y, e.outer_sq)
             away = own == 0
@@ -143,24 +145,24 @@ def _outcome(state, mask, out, params):
             ended = lost_or_captured(learner, begin, end, pos_x, pos_y, e.outer_sq, e.must_surround)
         if ended == _RUNNING and state.steps[world] >= e.horizon_steps:
             ended = _TIMEOUT
-        out[world] = ended
+        out[row] = ended
 
 
 @kernel
 def _reward(state, mask, outcome, out, params):
     e = params[0].episode
-    for world in range(out.shape[0]):
-        if not mask[world]:
+    for row in range(out.shape[0]):
+        if not mask[row]:
             continue
-        closer = came_closer(state, world) if e.rewards_progress else True
-        if outcome[world] == _RUNNING or (outcome[world] == _TIMEOUT and not e.timeout_fails):
+        closer = came_closer(state, row) if e.rewards_progress else True
+        if outcome[row] == _RUNNING or (outcome[row] == _TIMEOUT and not e.timeout_fails):
             share = e.reward_scale / STEP_REWARD_SHARE
-            good = state.outside_steps[world] == 0 and closer
+            good = state.outside_steps[row] == 0 and closer
             reward = share if good else -share
         else:
-            reward = e.reward_scale if outcome[world] == _GOAL else -e.reward_scale
-        out[world] = reward
-        state.episode_return[world] += reward
+            reward = e.reward_scale if outcome[row] == _GOAL else -e.reward_scale
+        out[row] = reward
+        state.episode_return[row] += reward
 
 
 @kernel
@@ -286,7 +288,7 @@ class EllipseMethod(Method):
         return {"greedy": act}
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.float32]) -> None:
-        """4.2.1: the state matrix `[num_worlds, rows * row_size]`, row after row."""
+        """4.2.1: the state matrix `[num_rows, rows * row_size]`, row after row."""
         _perceive(state, mask, out, self._order, self._distance_sq, self._params)
 
     def outcome(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:

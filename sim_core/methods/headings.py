@@ -28,11 +28,11 @@ def heading_velocities(config: WorldConfig, dtype: Any) -> NDArray[Any]:
 
 @kernel
 def _write_headings(table, action, out_x, out_y):
-    for world in range(action.shape[0]):
-        if action[world] < 0 or action[world] >= table.shape[0]:
+    for row in range(action.shape[0]):
+        if action[row] < 0 or action[row] >= table.shape[0]:
             raise ValueError("action must be in 0..num_actions - 1")
-        out_x[world] = table[action[world], 0]
-        out_y[world] = table[action[world], 1]
+        out_x[row] = table[action[row], 0]
+        out_y[row] = table[action[row], 1]
 
 
 @kernel
@@ -44,11 +44,11 @@ def turn_headings(action, parts, step, sectors):
 
 
 def write_headings(table: NDArray[Any], action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
-    """Writes u_nn `[num_worlds]` (m/s): row `action[world]` of `table` `[num_actions, 2]`.
+    """Writes u_nn `[num_rows]` (m/s): `table[action]` of `table` `[num_actions, 2]`.
 
     Raises:
-      ValueError: there is not one action a world, or one is none of the actions.
+      ValueError: there is not one action a learning robot, or one is none of the actions.
     """
     if action.shape != out_x.shape:
-        raise ValueError(f"action must have the shape {out_x.shape}, one a world, not {action.shape}")
+        raise ValueError(f"action must have the shape {out_x.shape}, one a learning robot, not {action.shape}")
     _write_headings(table, action, out_x, out_y)

@@ -18,7 +18,7 @@ from sim_core.methods.apf import field_of, field_params, limited
 from sim_core.methods.base import Preset
 from sim_core.methods.group_ellipses import BEST_WORLD, MOST_GROUPS, POOLED, THESIS, TURNED, EllipseMethod
 from sim_core.packed import packed
-from sim_core.state import WorldState
+from sim_core.state import WorldState, world_of
 
 TAUGHT: dict[str, Any] = {**TURNED, "teacher": "greedy"}
 SLOW_WORLD: dict[str, Any] = {**BEST_WORLD, "decision_interval_steps": 4}
@@ -27,10 +27,11 @@ SLOW_WORLD: dict[str, Any] = {**BEST_WORLD, "decision_interval_steps": 4}
 @kernel
 def _add_field(state, out_x, out_y, speed_limit_m_s, params):
     p = params[0]
-    for world in range(out_x.shape[0]):
+    for row in range(out_x.shape[0]):
+        world = world_of(state, row)
         pos_x, pos_y = state.pos_x[world], state.pos_y[world]
-        x, y = field_of(state.learner[world], 0, pos_x.shape[0], pos_x, pos_y, p)
-        out_x[world], out_y[world] = limited(out_x[world] + x, out_y[world] + y, speed_limit_m_s)
+        x, y = field_of(state.learner[row], 0, pos_x.shape[0], pos_x, pos_y, p)
+        out_x[row], out_y[row] = limited(out_x[row] + x, out_y[row] + y, speed_limit_m_s)
 
 
 class OutsideMethod(EllipseMethod):
@@ -68,7 +69,7 @@ class OutsideMethod(EllipseMethod):
         """u_l = u_nn + u_apf (4.2.2), with u_nn of Eq. 3.4.
 
         Raises:
-          ValueError: there is not one action a world, or one is none of the actions.
+          ValueError: there is not one action a row, or one is none of the actions.
         """
         super().velocity(state, action, out_x, out_y)
         _add_field(state, out_x, out_y, self._speed_limit_m_s, self._field)

@@ -21,7 +21,7 @@ from sim_core.jit import kernel
 from sim_core.methods.base import Method, Preset, Rule
 from sim_core.methods.progress import goal_offset
 from sim_core.packed import packed
-from sim_core.state import WorldState, own_group
+from sim_core.state import WorldState, own_group, world_of
 
 COUNT_LIMIT = 127
 """Counts saturate here, so that they fit int8."""
@@ -64,9 +64,9 @@ def sector_of(dx, dy, edges):
 
 
 @kernel
-def _goal_direction(state, world):
-    """Unit vector from the learning robot to its goal; +x where it stands on it."""
-    dx, dy = goal_offset(state, world)
+def _goal_direction(state, row):
+    """Unit vector from a row's learning robot to its goal; +x where it stands on it."""
+    dx, dy = goal_offset(state, row)
     length = np.sqrt(dx * dx + dy * dy)
     if length == 0.0:
         return np.cos(dx), dy  # (1, 0) of the positions' dtype
@@ -75,23 +75,23 @@ def _goal_direction(state, world):
 
 @kernel
 def _turn_to_goal(state, out_x, out_y):
-    for world in range(out_x.shape[0]):
-        cos, sin = _goal_direction(state, world)
-        x, y = out_x[world], out_y[world]
-        out_x[world], out_y[world] = cos * x - sin * y, sin * x + cos * y
+    for row in range(out_x.shape[0]):
+        cos, sin = _goal_direction(state, row)
+        x, y = out_x[row], out_y[row]
+        out_x[row], out_y[row] = cos * x - sin * y, sin * x + cos * y
 
 
 @kernel
 def _perceive(state, mask, out, edges, params):
     p = params[0]
-    for world in range(mask.shape[0]):
-        if not mask[world]:
+    for row in range(mask.shape[0]):
+        if not mask[row]:
             continue
+        world, learner = world_of(state, row), state.learner[row]
         pos_x, pos_y = state.pos_x[world], state.pos_y[world]
-        learner = state.learner[world]
-        _, group_begin, group_end = own_group(state, world)
-        cos, sin = _goal_direction(state, world)
-        out[world, :] = 0
+        _, group_begin, group_end = own_group(state, row)
+        cos, sin = _goal_direction(state, row)
+        out[row, :] = 0
         for other in range(pos_x.shape[0]):
             dx, dy = pos_x[other] - pos_x[learner], pos_y[other] - pos_y[learner]
             dist_sq = dx * dx + dy * dy
@@ -103,7 +103,7 @@ def _perceive(state, mask, out, edges, params):
             step = 1
             if not group_begin <= other < group_end:
                 cell, step = (cell + 2 * p.sectors, 1) if p.separate else (cell, -1)
-            out[world, cell] = min(max(out[world, cell] + step, -COUNT_LIMIT), COUNT_LIMIT)
+            out[row, cell] = min(max(out[row, cell] + step, -COUNT_LIMIT), COUNT_LIMIT)
 
 
 @kernel
@@ -200,12 +200,12 @@ class SensorMethod(Method):
         """Eq. 3.4: constant speed towards the chosen sector's centre, in the frame of the sectors.
 
         Raises:
-          ValueError: there is not one action a world, or one is none of the actions.
+          ValueError: there is not one action a row, or one is none of the actions.
         """
         super().velocity(state, action, out_x, out_y)
         if self._faces_goal:
             _turn_to_goal(state, out_x, out_y)
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
-        """3.2.1: `[num_worlds, 2q]` counts, the inner disc's q first; apart, 2q of the own group, then 2q of others."""
+        """3.2.1: `[num_rows, 2q]` counts, the inner disc's q first; apart, 2q of the own group, then 2q of others."""
         _perceive(state, mask, out, self._edges, self._params)

@@ -1,6 +1,7 @@
 """One step of the swarm in every world: all robots read the old state, then all move.
 
-The learning robot moves with the velocity that it is given. Without a command FL-ORCA drives it like every other robot.
+Learning robots move with the velocities that they are given. Without a command FL-ORCA drives them like every other
+robot, and it always drives those whose episode has ended.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from sim_core.jit import inlined, kernel
 from sim_core.lanes import LANES, any_lane, load, scatter, splat
 from sim_core.orca import ORCAParams, build_half_planes, orca_params, orca_velocity
 from sim_core.rng import skip_ahead, uniform_at
+from sim_core.state import learners_per_world
 from sim_core.swarm.flock_rules import (
     FOLLOWER_LEVEL_1,
     FOLLOWER_LEVEL_2,
@@ -92,10 +94,10 @@ def _load_world(world, first_slot, state, tile, p):
 
 
 @inlined
-def load_tile(first_world, num_worlds, state, tile, p):
+def load_tile(first_world, num_worlds, state, running, tile, p):
     """Copies the old state of `num_worlds` worlds into the tile and arranges the candidates of the neighbour search.
 
-    A learning robot that the swarm does not know is hidden: it is nobody's neighbour.
+    A running learning robot that the swarm does not know is hidden: it is nobody's neighbour.
 
     Returns:
       The number of rows.
@@ -110,9 +112,11 @@ def load_tile(first_world, num_worlds, state, tile, p):
         for slot in range(num_worlds * num_robots, rows * LANES):
             tile.pos_vel[slot, 0] = p.nan
     if not p.knows_learner:
-        for i in range(num_worlds):
-            learner = i * num_robots + state.learner[first_world + i]
-            tile.candidate_x[tile.grid.rank[learner] if p.neighbours.use_grid else learner] = p.nan
+        per_world = learners_per_world(state)
+        for row in range(first_world * per_world, (first_world + num_worlds) * per_world):
+            learner = (row // per_world - first_world) * num_robots + state.learner[row]
+            if running[row]:
+                tile.candidate_x[tile.grid.rank[learner] if p.neighbours.use_grid else learner] = p.nan
     return rows
 
 
@@ -167,11 +171,14 @@ def compute_velocities(tile_index, num_slots, rows, tile, rng, p):
 
 
 @inlined
-def move_world(world, first_slot, state, tile, command_x, command_y, use_command, p):
+def move_world(world, first_slot, state, running, tile, command_x, command_y, use_command, p):
     """Moves one world's robots with the tile's new velocities (explicit Euler), and counts the step."""
     if use_command:
-        tile.new_vx[first_slot + state.learner[world]] = command_x[world]
-        tile.new_vy[first_slot + state.learner[world]] = command_y[world]
+        per_world = learners_per_world(state)
+        for row in range(world * per_world, (world + 1) * per_world):
+            if running[row]:
+                tile.new_vx[first_slot + state.learner[row]] = command_x[row]
+                tile.new_vy[first_slot + state.learner[row]] = command_y[row]
     for i in range(state.pos_x.shape[1]):
         vx, vy = tile.new_vx[first_slot + i], tile.new_vy[first_slot + i]
         state.vel_x[world, i], state.vel_y[world, i] = vx, vy
@@ -184,15 +191,16 @@ def move_world(world, first_slot, state, tile, command_x, command_y, use_command
 
 
 @kernel
-def advance(state, tile, mask, command_x, command_y, use_command, params):
+def advance(state, tile, mask, running, command_x, command_y, use_command, params):
     """Advances worlds by one simulator step.
 
     Args:
       state: WorldState, changed in place.
       tile: Tile.
       mask: `[num_worlds]` bool, the worlds to advance; the others stay as they are.
-      command_x, command_y: `[num_worlds]`, the learning robot's velocity, m/s.
-      use_command: whether the learning robot moves with the command; else FL-ORCA drives it too.
+      running: `[num_rows]` bool, the learning robots whose episode goes on; the others are robots of the swarm.
+      command_x, command_y: `[num_rows]`, the learning robots' velocities, m/s.
+      use_command: whether running learning robots move with the commands; else FL-ORCA drives them too.
       params: SwarmParams, packed.
     """
     p = params[0]
@@ -201,11 +209,12 @@ def advance(state, tile, mask, command_x, command_y, use_command, params):
         worlds = min(p.worlds_per_tile, num_worlds - first_world)
         if not mask[first_world : first_world + worlds].any():
             continue
-        rows = load_tile(first_world, worlds, state, tile, p)
+        rows = load_tile(first_world, worlds, state, running, tile, p)
         compute_velocities(first_world // p.worlds_per_tile, worlds * num_robots, rows, tile, state.rng, p)
         for i in range(worlds):
             if mask[first_world + i]:
-                move_world(first_world + i, i * num_robots, state, tile, command_x, command_y, use_command, p)
+                world, slot = first_world + i, i * num_robots
+                move_world(world, slot, state, running, tile, command_x, command_y, use_command, p)
 
 
 @kernel
@@ -220,12 +229,14 @@ def reset_episode(state, mask):
         if not mask[world]:
             continue
         state.steps[world] = 0
-        state.outside_steps[world] = 0
-        state.episode_return[world] = 0.0
-        learner = state.learner[world]
-        group = state.group[learner]
-        dx = state.pos_x[world, learner] - state.goal_x[world, group]
-        dy = state.pos_y[world, learner] - state.goal_y[world, group]
-        state.goal_distance_m[world] = np.sqrt(dx * dx + dy * dy)
+        per_world = learners_per_world(state)
+        for row in range(world * per_world, (world + 1) * per_world):
+            state.outside_steps[row] = 0
+            state.episode_return[row] = 0.0
+            learner = state.learner[row]
+            group = state.group[learner]
+            dx = state.pos_x[world, learner] - state.goal_x[world, group]
+            dy = state.pos_y[world, learner] - state.goal_y[world, group]
+            state.goal_distance_m[row] = np.sqrt(dx * dx + dy * dy)
         for i in range(state.pos_x.shape[1]):
             state.machine[world, i] = 0

@@ -47,13 +47,13 @@ def _cycles(typingctx: Any) -> Any:
 
 
 @kernel
-def _timed_advance(state, tile, command, spent, params):
+def _timed_advance(state, tile, running, command, spent, params):
     p = params[0]
     num_worlds, size = state.pos_x.shape
     for first in range(0, num_worlds, p.worlds_per_tile):
         worlds, index = min(p.worlds_per_tile, num_worlds - first), first // p.worlds_per_tile
         t = _cycles()
-        rows = step.load_tile(first, worlds, state, tile, p)
+        rows = step.load_tile(first, worlds, state, running, tile, p)
         spent[0] += _cycles() - t
         t = _cycles()
         for row in range(rows):
@@ -78,7 +78,7 @@ def _timed_advance(state, tile, command, spent, params):
             spent[5] += _cycles() - t
         t = _cycles()
         for i in range(worlds):
-            step.move_world(first + i, i * size, state, tile, command, command, False, p)
+            step.move_world(first + i, i * size, state, running, tile, command, command, False, p)
         spent[6] += _cycles() - t
 
 
@@ -86,13 +86,14 @@ def pass_ns(config: WorldConfig) -> list[float]:
     """Nanoseconds a robot step of every pass, over episodes of FL-ORCA alone from their start."""
     worlds = WorldBatch(config, NUM_WORLDS)
     command, spent = np.zeros(NUM_WORLDS, np.float32), np.zeros(len(PASSES), np.int64)
-    _timed_advance(worlds.state, worlds.tile, command, spent, worlds.swarm)
+    running = np.ones(NUM_WORLDS, np.bool_)
+    _timed_advance(worlds.state, worlds.tile, running, command, spent, worlds.swarm)
     spent[:] = 0
     start_s, start_cycles = time.perf_counter(), _now()
     for _ in range(EPISODES):
         worlds.reset()
         for _ in range(EPISODE_STEPS):
-            _timed_advance(worlds.state, worlds.tile, command, spent, worlds.swarm)
+            _timed_advance(worlds.state, worlds.tile, running, command, spent, worlds.swarm)
     ns_per_cycle = 1e9 * (time.perf_counter() - start_s) / (_now() - start_cycles)
     robot_steps = EPISODES * EPISODE_STEPS * NUM_WORLDS * config.num_robots
     return [float(ns_per_cycle * cycles / robot_steps) for cycles in spent]

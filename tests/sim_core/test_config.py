@@ -80,7 +80,7 @@ def test_flags_must_be_bool(name, value):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("value", ["", "other", 1, None])
+@pytest.mark.parametrize("value", ["", "other", True, None])
 def test_names_must_be_known(name, value):
     refuses(name, **{name: value})
 

@@ -13,7 +13,7 @@ from tests.packed import unpack
 
 DTYPE = transition_dtype(gym.spaces.Box(-1e6, 1e6, (2,), np.float32))
 ROW = packed_dtype(DTYPE)
-RUNS, TERMINATES, TRUNCATES = 0, 1, 2
+RUNS, TERMINATES, TRUNCATES, WAITS = 0, 1, 2, 3
 DISCOUNT = 0.9
 
 
@@ -21,6 +21,8 @@ def reference(rewards, ends, n_step):
     """Rows (start, action, return, discount, next state) of one environment, oldest first."""
     rows, start = [], 0
     for stop in [*np.flatnonzero(ends) + 1, len(ends)]:
+        if stop > start and ends[stop - 1] == WAITS:
+            start = stop  # a step that is none
         ended = stop > start and ends[stop - 1] != RUNS
         for t in range(start, stop):
             last = min(t + n_step, stop)
@@ -38,7 +40,9 @@ def steps_of(rewards, ends, steps):
     env, t = np.meshgrid(np.arange(rewards.shape[1]), list(steps))
     seen = np.stack([env, t], axis=-1).astype(np.float32)
     chosen = ends[list(steps)]
-    return Steps(seen, t % 7, rewards[list(steps)], seen + np.float32([0, 1]), chosen == TERMINATES, chosen != RUNS)
+    done = (chosen == TERMINATES) | (chosen == TRUNCATES)
+    after = seen + np.float32([0, 1])
+    return Steps(seen, t % 7, rewards[list(steps)], after, chosen == TERMINATES, done, chosen != WAITS)
 
 
 def push_all(assembler, rewards, ends, steps, cuts=()):
@@ -58,8 +62,11 @@ def of_env(rows, env):
 @st.composite
 def histories(draw):
     num_envs, steps = draw(st.integers(1, 3)), draw(st.integers(1, 14))
-    flags = st.lists(st.sampled_from([RUNS, RUNS, TERMINATES, TRUNCATES]), min_size=steps, max_size=steps)
+    flags = st.lists(st.sampled_from([RUNS, RUNS, TERMINATES, TRUNCATES, WAITS]), min_size=steps, max_size=steps)
     ends = np.array([draw(flags) for _ in range(num_envs)]).T
+    for step, env in zip(*np.nonzero(ends == WAITS), strict=True):
+        if step == 0 or ends[step - 1, env] == RUNS:
+            ends[step, env] = RUNS  # only where an episode has ended does a robot wait
     rewards = np.random.default_rng(draw(st.integers(0, 99))).normal(size=ends.shape)
     return rewards, ends
 

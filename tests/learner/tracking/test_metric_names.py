@@ -4,14 +4,17 @@ import re
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from actors.service.messages import TEAM_DTYPE, EpisodeStats
 from learner.config import RunConfig
 from learner.loop import TrainingLoop
 from learner.tracking.journal import Journal, mlflow_metrics
 from learner.tracking.metric_names import ENV_STEPS, METRICS
 from learner.training.cluster import ProcessCluster
+from learner.training.evaluation_summary import as_metrics, summarise
 from tests.checkpointing import Silent
 
 README = Path(__file__).parents[3] / "learner" / "README.md"
@@ -27,7 +30,7 @@ def journal_names(config: RunConfig, folder: Path) -> set[str]:
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory, small_run):
-    """Names from a run of our environment and a run of one without outcomes."""
+    """Names from a run of our environment, from a run of one without outcomes, and from an evaluation of teams."""
     plain = dict(
         engine="process",
         total_env_steps=2_000,
@@ -41,7 +44,11 @@ def written(tmp_path_factory, small_run):
     )
     ours = RunConfig(world=small_run.world, **plain)
     other = RunConfig(env_id="CartPole-v1", **plain)
-    return journal_names(ours, tmp_path_factory.mktemp("ours")) | journal_names(other, tmp_path_factory.mktemp("other"))
+    names = journal_names(ours, tmp_path_factory.mktemp("ours"))
+    names |= journal_names(other, tmp_path_factory.mktemp("other"))
+    goal, team = np.ones(2, np.int8), np.ones(2, TEAM_DTYPE)
+    metrics = as_metrics(summarise(EpisodeStats(goal, np.ones(2, np.int32), np.ones(2), team)))
+    return names | {f"eval/{name}" for name in metrics}
 
 
 def test_the_table_lists_exactly_the_metrics_of_the_journal(written):
