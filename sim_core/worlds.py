@@ -29,8 +29,6 @@ FAR_M = 1e3
 """Where FL-ORCA in the learning robot's place puts robots that it does not sense: far from all others."""
 
 
-
-
 class Command(NamedTuple):
     """Velocities for the learning robots that are given from outside: by a person, or any other controller.
 
