@@ -184,7 +184,7 @@ def time_table(findings: Findings, other: Path | None) -> Table:
         table.add_column(name, justify="left" if name.startswith("from") else "right")
     ours = findings.seconds[HERE]
     for name, seconds in ours.items():
-        unit = ratio(seconds, ours[UNIT]).text(1) if len(seconds) == len(ours[UNIT]) else ""
+        unit = ratio(seconds, ours[UNIT]).text(1) if UNIT in ours else ""
         target = f"≤ {TARGETS_S[name]:g}" if name in TARGETS_S else ""
         theirs = findings.seconds[other].get(name) if other else None
         compared = ratio(seconds, theirs).text(2) if theirs else ""
@@ -220,11 +220,12 @@ def main(against: Path | None = None) -> None:
         for checkout in checkouts:
             findings.measure(checkout)
         findings.seconds[HERE][RECOVERED].append(recover())
-    for checkout in checkouts:
-        findings.measure_cold(checkout)
-    console = Console(width=120)
+    console, cold = Console(width=120), Findings()
     console.print(time_table(findings, other))
     console.print(cpu_table(findings, other))
+    for checkout in checkouts:
+        cold.measure_cold(checkout)
+    console.print(time_table(cold, other))
     console.print(f"load of the machine: {', '.join(f'{load:.1f}' for load in os.getloadavg())} (1, 5, 15 minutes)")
 
 

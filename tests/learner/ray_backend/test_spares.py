@@ -5,6 +5,7 @@ import os
 import time
 
 import numpy as np
+import psutil
 import pytest
 
 from actors.policy.policy import WeightsSnapshot
@@ -12,6 +13,7 @@ from actors.replay.node import ShardNode
 from actors.rollout.node import RolloutNode
 from actors.rollout.vector_env import env_shape
 from actors.service.rpc import LocalCalls, local_handle
+from deploy.chaos.processes import TITLES
 from learner.cluster_options import ClusterOptions
 from learner.ray_backend.spares import SpareShard, SpareWorker
 from learner.training.cluster import rollout_settings, shard_settings
@@ -63,6 +65,49 @@ def test_a_spare_shard_that_has_begun_is_empty_and_stores():
     assert shard.size() > 0
 
 
+def is_seen_as(pid, *kinds):
+    """Whether the title of a process is that of a component of one of the kinds."""
+    return psutil.Process(pid).cmdline()[0].startswith(tuple(title for kind in kinds for title in TITLES[kind]))
+
+
+def wait_until(condition):
+    end_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.05)
+
+
+@pytest.mark.ray
+def test_a_spare_that_could_not_start_is_replaced():
+    import ray
+
+    from learner.ray_backend.cluster import connect, leave
+    from learner.ray_backend.spares import Spare, Spares
+
+    class Fails(Spare):
+        def __init__(self):
+            raise ValueError("no kernels here")
+
+    class Works(Spare):
+        def begin(self):
+            pass
+
+    connect(1, None, 1)
+    try:
+        kinds = [Works, Fails]
+        spares = Spares(1, lambda: ray.remote(num_cpus=0)(kinds.pop()).remote())
+        spares.keep()
+        ((_, ready),) = spares._waiting
+        ray.wait([ready], timeout=PATIENCE_S)
+        spares.keep()
+        ((spare, ready),) = spares._waiting
+        assert ray.get(ready, timeout=PATIENCE_S) and not kinds
+        assert spares.take() is spare
+        assert spares.take() is None
+    finally:
+        leave()
+
+
 @pytest.mark.ray
 def test_spares_take_the_places_of_lost_actors_and_are_replaced():
     import ray
@@ -83,9 +128,13 @@ def test_spares_take_the_places_of_lost_actors_and_are_replaced():
         (worker, ready), (shard, other_ready) = (pair for spares in waiting for pair in spares._waiting)
         ray.get([ready, other_ready], timeout=PATIENCE_S)
         spare_pids = [pid(worker), pid(shard)]
+        for number in spare_pids:
+            assert not is_seen_as(number, *TITLES), "nobody mistakes a spare that waits for a component"
         cluster.discard(cluster.workers[0])
         assert pid(cluster.place_worker(0, 1)) == spare_pids[0]
         assert pid(cluster.place_shard(0, 1)) == spare_pids[1]
+        wait_until(lambda: is_seen_as(spare_pids[0], "rollout worker"))
+        wait_until(lambda: is_seen_as(spare_pids[1], "replay shard"))
         assert not any(spares._waiting for spares in waiting)
 
         cluster.keep_spares()
@@ -93,9 +142,7 @@ def test_spares_take_the_places_of_lost_actors_and_are_replaced():
         ray.get(ready, timeout=PATIENCE_S)
         number = pid(dead)
         ray.kill(dead)
-        end_s = time.monotonic() + PATIENCE_S
-        while os.path.exists(f"/proc/{number}") and time.monotonic() < end_s:
-            time.sleep(0.05)
+        wait_until(lambda: not os.path.exists(f"/proc/{number}"))
         made = cluster.place_worker(0, 2)  # a spare that died after it was ready is found out by its first call
         with pytest.raises(ray.exceptions.RayActorError):
             ray.get(made.set_weights.remote(weights(config)), timeout=PATIENCE_S)
