@@ -254,6 +254,10 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
         self._ended = done
         return observation, reward, terminated, done & ~terminated, infos
 
+    def waiting(self) -> NDArray[np.bool_]:
+        """Where a robot's episode has ended and its world has not `[num_envs]`: its next action is not taken."""
+        return is_done(self.worlds.outcome) if self.config.num_learners > 1 else np.zeros(self.num_envs, np.bool_)
+
     def _step_of_robots(
         self, result: StepResult
     ) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:

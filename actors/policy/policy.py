@@ -41,7 +41,7 @@ class WeightsSnapshot(NamedTuple):
 class Policy:
     """The compiled policy of a weights snapshot.
 
-    The workspace is kept between calls, since allocating it takes as long as filling it.
+    The workspace is kept between calls, since allocating it takes as long as filling it; smaller batches take a part.
 
     Args:
       weights: the snapshot to act with.
@@ -53,7 +53,7 @@ class Policy:
         shared = 4 if weights.row_size else 0  # arrays of the two layers that all rows share
         self._shared = Layers(tuple(copies[:shared:2]), tuple(copies[1:shared:2]))
         self._layers = Layers(tuple(copies[shared::2]), tuple(copies[shared + 1 :: 2]))
-        self._workspace = make_workspace(0, self._layers)
+        self._room = self._workspace = make_workspace(0, self._layers)
         self._encoder: RowEncoder | None = None
 
     def values(self, observation: NDArray[np.generic]) -> NDArray[np.float32]:
@@ -71,14 +71,16 @@ class Policy:
 
     def _load(self, observation: NDArray[np.generic]) -> None:
         count = len(observation)
-        if len(self._workspace[0]) != count:
-            self._workspace, self._encoder = make_workspace(count, self._layers), None
+        if len(self._room[0]) < count:
+            self._room, self._encoder = make_workspace(count, self._layers), None
+        self._workspace = tuple(array[:count] for array in self._room)
         if not self.weights.row_size:
             self._workspace[0][...] = observation.reshape(count, -1)
             return
         rows = np.ascontiguousarray(observation.reshape(count, -1), np.float32)
         if self._encoder is None:
-            self._encoder = make_row_encoder(count, rows.shape[1] // self.weights.row_size, self._shared)
+            most = len(self._room[0])
+            self._encoder = make_row_encoder(most, rows.shape[1] // self.weights.row_size, self._shared)
         _encode(rows, self._shared, self._encoder, self._workspace[0])
 
 

@@ -92,6 +92,10 @@ class JoinedVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDAr
             "_final_info": ended,
         }
 
+    def waiting(self) -> NDArray[np.bool_]:
+        """As `SwarmVectorEnv.waiting`."""
+        return np.concatenate([part.waiting() for part in self._parts])
+
     def get_state(self) -> Arrays:
         """Copies of all arrays that a checkpoint needs, by part and name."""
         states = [part.get_state() for part in self._parts]

@@ -60,6 +60,7 @@ class RolloutWorker:
         shape = spaces_of(self._env)
         self._num_actions = shape.num_actions
         self._num_envs = num_envs = self._env.num_envs
+        self._may_wait = max(settings.env.learners()) > 1
         self._dtype = packed_dtype(transition_dtype(shape.observation_space))
         seeds = np.random.SeedSequence((settings.seed, worker_id, incarnation))
         env_seeds, policy_seed = seeds.spawn(2)
@@ -125,7 +126,7 @@ class RolloutWorker:
         self, policy: Policy, random_actions: NDArray[np.int64], steps: Steps, ended: EpisodeStats, i: int
     ) -> None:
         """Steps every environment once; writes row i of `steps`, and of `ended` where an episode ends."""
-        action = explore(policy.greedy(self._observation), random_actions)
+        action = explore(self._greedy(policy), random_actions)
         observation, reward, terminated, truncated, infos = self._env.step(action)
         done = terminated | truncated
         steps.observation[i], steps.action[i], steps.reward[i] = self._observation, action, reward
@@ -142,6 +143,15 @@ class RolloutWorker:
             ended.episode_return[i] = self._return
             self._length[done] = 0
             self._return[done] = 0.0
+
+    def _greedy(self, policy: Policy) -> NDArray[np.int64]:
+        """The policy's actions `[num_envs]`; 0 for robots that wait for their world's end, which take none."""
+        if not self._may_wait:
+            return policy.greedy(self._observation)
+        assert isinstance(self._env, SwarmVectorEnv | JoinedVectorEnv)
+        decides, action = ~self._env.waiting(), np.zeros(self._num_envs, np.int64)
+        action[decides] = policy.greedy(self._observation[decides])
+        return action
 
     def close(self) -> None:
         """Closes the environments."""
