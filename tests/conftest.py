@@ -1,6 +1,7 @@
 """What all tests share: a process that any of them may start Ray in, its share of the tests, and moto's S3 server."""
 
 import os
+import signal
 from collections.abc import Iterator
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 
 from learner.ray_backend.auth import guard_ray
 
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup has it ignored, and tests send it
 guard_ray(joins=False)  # as `shoal` does: Ray reads this once, when the first test module imports it
 
 BUCKET = "shoal-tests"

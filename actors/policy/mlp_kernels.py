@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+import importlib
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from sim_core.jit import inlined, inlined_blas
 
@@ -17,6 +20,16 @@ class Layers(NamedTuple):
 
     weights: tuple[Floats, ...]
     biases: tuple[Floats, ...]
+
+
+@functools.cache
+def use_one_blas_thread() -> None:
+    """Has BLAS multiply with one thread in this process from now on: with more, products differ in their last bits.
+
+    The number of threads would otherwise depend on who has imported SciPy before, and with it what a run learns.
+    """
+    importlib.import_module("scipy.linalg.cython_blas")  # whose BLAS numba calls; only a loaded one can be limited
+    threadpool_limits(1, "blas")
 
 
 def make_workspace(count: int, layers: Layers) -> tuple[Floats, ...]:

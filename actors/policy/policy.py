@@ -20,6 +20,7 @@ from actors.policy.mlp_kernels import (
     forward,
     make_row_encoder,
     make_workspace,
+    use_one_blas_thread,
 )
 from sim_core.jit import kernel
 
@@ -48,6 +49,7 @@ class Policy:
     """
 
     def __init__(self, weights: WeightsSnapshot) -> None:
+        use_one_blas_thread()
         self.weights = weights
         copies = [array.copy() for array in weights.arrays]  # arrays from Ray are read-only: another numba type
         shared = 4 if weights.row_size else 0  # arrays of the two layers that all rows share

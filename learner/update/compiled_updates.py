@@ -27,6 +27,7 @@ from actors.policy.mlp_kernels import (
     make_workspace,
     multiply,
     squared_norm,
+    use_one_blas_thread,
 )
 from actors.policy.network import PooledNetwork
 from learner.config import RunConfig
@@ -117,6 +118,7 @@ class CompiledUpdates:
     def __init__(self, online: FlatNetwork, target: FlatNetwork, optimiser: Adam, config: RunConfig) -> None:
         self._online, self._target, self._optimiser = online, target, optimiser
         self._size = config.batch_size
+        use_one_blas_thread()
         shared = 2 if isinstance(online.network, PooledNetwork) else 0
         self._layers, self._target_layers = _arrays(online.layers[shared:]), _arrays(target.layers[shared:])
         self._grads = _arrays(online.grads[shared:])
