@@ -209,6 +209,12 @@ class WorldConfig:
     """What the shield keeps free around every robot, beyond robot_radius_m."""
     shield_horizon_s: float = 0.5
     """How far ahead the shield avoids collisions."""
+    kinematics: Literal["holonomic", "unicycle"] = "holonomic"
+    """The learning robot reaches any velocity at once, or drives where it faces, within the two limits below (ours)."""
+    turn_rate_limit_deg_s: float = 180.0
+    """`unicycle`: largest turn rate."""
+    acceleration_limit_m_s2: float = 2.0
+    """`unicycle`: largest change of speed."""
     conditions: Literal["fixed", "drawn"] = "fixed"
     """position_noise_m to heading_error_deg hold as they are, or each episode draws each between none and its value."""
 
@@ -310,6 +316,11 @@ class WorldConfig:
         return _differs(self, COMMAND_CONDITIONS)
 
     @property
+    def corrects_commands(self) -> bool:
+        """Whether the learning robot drives other velocities than it is asked for: its shield's, or a unicycle's."""
+        return self.shield != "none" or self.kinematics != "holonomic"
+
+    @property
     def setup(self) -> str:
         """The setup as the dissertation writes it, such as `10r×2g`; another scene's name stands before it."""
         sizes = self.group_sizes
@@ -409,7 +420,7 @@ POSITIVE = (
     "robot_radius_m max_speed_m_s orca_radius_m orca_horizon_s neighbour_range_m separation_range_m sight_range_m "
     "view_range_m uniform_separation_range_m uniform_view_corridor_m uniform_slow_radius_m ellipse_chi_square "
     "ellipse_smallest_half_axis_m ellipse_scale_per_m goal_scale_per_m apf_range_m apf_limit_m_s "
-    "learner_speed_limit_m_s shield_horizon_s"
+    "learner_speed_limit_m_s shield_horizon_s turn_rate_limit_deg_s acceleration_limit_m_s2"
 ).split()
 NON_NEGATIVE = (
     "start_jitter_m separation_noise cohesion_weight separation_weight alignment_weight apf_gain_m4_s "
@@ -500,4 +511,9 @@ def _check_conditions(config: WorldConfig) -> None:
         config.shield_horizon_s >= config.time_step_s,
         f"shield_horizon_s ({config.shield_horizon_s}) must be at least time_step_s ({config.time_step_s}), or robots "
         "collide within the step that the shield looks ahead",
+    )
+    require(
+        config.shield == "none" or config.kinematics == "holonomic",
+        "shield = orca permits velocities to a robot that reaches them at once, which a unicycle does not; set "
+        "kinematics = holonomic or shield = none",
     )

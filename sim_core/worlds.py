@@ -24,6 +24,7 @@ from sim_core.state import CONSTANT, WorldState, empty_state
 from sim_core.swarm.step import advance, reset_episode, swarm_params
 from sim_core.swarm.tile import world_tile
 from sim_core.team import mark_learner_collisions, segregated_fraction
+from sim_core.unicycle import Unicycle
 
 FAR_M = 1e3
 """Where FL-ORCA in the learning robot's place puts robots that it does not sense: far from all others."""
@@ -32,7 +33,7 @@ FAR_M = 1e3
 class Command(NamedTuple):
     """Velocities for the learning robots that are given from outside: by a person, or any other controller.
 
-    They take the place of an action's; shield and errors of driving apply as to those.
+    They take the place of an action's; shield, errors of driving and a unicycle's limits apply as to those.
     """
 
     velocity: NDArray[np.float32]
@@ -79,7 +80,7 @@ class WorldBatch:
         several learning robots a world, `sensed` may hold a world for each row (`sim_core.rows.RowView`).
       outcome: `[num_rows]` int8, how the episodes ended; RUNNING while they go on.
       step_reward: `[num_rows]` float32, reward of the last simulator step.
-      asked: `[2, num_rows]` float32, m/s: the velocity of the last step before shield and errors of driving.
+      asked: `[2, num_rows]` float32, m/s: the velocity of the last step before shield, errors of driving, unicycle.
       hit_learner: `[num_rows]` bool, whether an episode ended in a collision with another running learning robot.
     """
 
@@ -97,11 +98,13 @@ class WorldBatch:
         scene_learner = np.zeros(num_worlds, np.int32) if self._several else self.state.learner
         self._scene_state = self.state._replace(learner=scene_learner)
         impaired, shielded = config.senses_badly or config.drives_badly, config.shield == "orca"
-        wants_rows = self._several and (impaired or shielded or bool(config.source(METHODS)))
+        is_unicycle = config.kinematics == "unicycle"
+        wants_rows = self._several and (impaired or shielded or is_unicycle or bool(config.source(METHODS)))
         self._view = RowView(self.state) if wants_rows else None
         self._known: WorldState = self.state if self._view is None else self._view.state
         self._senses = Senses(config, self._known) if impaired else None
         self._shield = Shield(config) if shielded else None
+        self._unicycle = Unicycle(config, num_rows) if is_unicycle else None
         self.sensed: WorldState = self._known if self._senses is None else self._senses.sensed
         self.asked = np.zeros((2, num_rows), np.float32)
         self._command = np.zeros((2, num_rows), np.float32)
@@ -147,6 +150,8 @@ class WorldBatch:
         self._refresh()
         if self._senses is not None:
             self._senses.begin(rows)
+        if self._unicycle is not None:
+            self._unicycle.begin(self._known, rows)
         self.method.perceive(self.sensed, rows, self._observation)
         if self.config.history > 1:
             self._history[rows] = self._observation[rows, None]
@@ -249,7 +254,8 @@ class WorldBatch:
 
     def _give_command(self, action: Decision) -> bool:
         """Writes the velocities that the learning robots drive; returns False where FL-ORCA drives as it is."""
-        command, as_asked = self._command, self._senses is None and self._shield is None
+        command, stages = self._command, (self._senses, self._shield, self._unicycle)
+        as_asked = all(stage is None for stage in stages)
         if isinstance(action, Pilot):
             if as_asked:
                 return False
@@ -265,6 +271,8 @@ class WorldBatch:
             self._shield.project(self.sensed, self._running, self._command_x, self._command_y)
         if self._senses is not None:
             self._senses.drive(self._running, self._command_x, self._command_y)
+        if self._unicycle is not None:
+            self._unicycle.drive(self._running, self._command_x, self._command_y)
         return True
 
     def _swarm_velocity(self) -> NDArray[np.float32]:
@@ -320,6 +328,7 @@ class WorldBatch:
         """The arrays that steps change."""
         changing = {name: array for name, array in self.state._asdict().items() if name not in CONSTANT}
         changing |= {} if self._senses is None else self._senses.arrays()
+        changing |= {} if self._unicycle is None else self._unicycle.arrays()
         changing |= {"outcome": self.outcome} if self._several else {}
         return changing | ({"history": self._history} if self.config.history > 1 else {})
 

@@ -12,7 +12,7 @@ from sim_core.config import COMMAND_CONDITIONS, SENSE_CONDITIONS, WorldConfig
 
 CONDITIONS = (*SENSE_CONDITIONS, *COMMAND_CONDITIONS, "burst_steps")
 """Fields of the world that a grid sets; what no axis names has its default."""
-VARIABLE = (*CONDITIONS, "shield")
+VARIABLE = (*CONDITIONS, "shield", "kinematics", "turn_rate_limit_deg_s", "acceleration_limit_m_s2")
 """Fields of the world that an axis may name."""
 DEFAULTS = {field.name: field.default for field in dataclasses.fields(WorldConfig)}
 BROKEN = 0.5
@@ -73,7 +73,7 @@ def grid(axes: Sequence[Axis]) -> list[Condition]:
 
 
 def world_under(world: WorldConfig, condition: Condition) -> WorldConfig:
-    """The world under a condition alone, whatever it was trained with; its shield stays unless the condition has one.
+    """The world under a condition alone, whatever it was trained with; shield and kinematics stay unless it has them.
 
     Raises:
       ConfigError: a value cannot be.

@@ -77,7 +77,7 @@ class Recording:
         rows = {name: np.stack(self._rows[name][first:]) for name in ("position", "velocity", "machine")}
         if self._config.senses_badly:
             rows["sensed"] = np.stack(self._rows["sensed"][first:])
-        if self._config.shield != "none":
+        if self._config.corrects_commands:
             rows["asked"] = np.stack([*self._rows["asked"][first:], np.zeros(2, np.float32)])
         return Episode(
             **rows,

@@ -35,7 +35,7 @@ class Episode(NamedTuple):
 
     Empty unless the world has them: sensed `[T + 1, num_robots, 2]` float32 (metres), positions as the learning robot
     senses them, NaN for none; asked `[T + 1, 2]` float32 (m/s), the velocity that was asked for in the state of the
-    same row, before the shield (final row: 0).
+    same row, before shield or unicycle (final row: 0).
     """
 
     position: NDArray[np.float32]

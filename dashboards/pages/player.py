@@ -86,7 +86,7 @@ def player_data(episode: Episode, config: WorldConfig) -> dict[str, Any]:
     - `machine` `[T + 1, num_robots]` uint8: states of the FL-ORCA machine (`sim_core.swarm.flock_rules.STATE_NAMES`).
     - `actions` `[T + 1]` int8: the learning robot's actions.
     - `sensed`, as `positions`: where the learning robot senses the robots, -2^15 for nowhere; null if it senses well.
-    - `asked` `[T + 1, 2]` int16: the velocity asked for before the shield, mm/s; null without one.
+    - `asked` `[T + 1, 2]` int16: the velocity asked for before shield or unicycle, mm/s; null without.
 
     Raises:
       ValueError: the positions are not finite, or not those of `config.num_robots` robots.

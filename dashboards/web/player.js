@@ -7,7 +7,7 @@ const show = {sensing: true, sensed: true, ellipses: true, velocity: false, mach
 let data = null;     // the episode, as from player_data in dashboards/pages/player.py
 let groupOfRobot = [], numRobots = 0, learnerGroup = 0, positions = null, machine = null, actions = null;
 let sensed = null;   // positions as the learning robot senses them, metres; null if it senses well
-let asked = null;    // velocity asked for before the shield, mm/s; null without one
+let asked = null;    // velocity asked for before shield or unicycle, mm/s; null without
 let selected = 0;    // robot whose ORCA lines are shown
 let step = 0;        // step that is shown; fractional while playing
 let playing = false;

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -104,6 +105,17 @@ def shield_numbers(world: WorldConfig) -> dict[str, Any]:
     }
 
 
+def kinematic_numbers(world: WorldConfig) -> dict[str, Any]:
+    """How the robot reaches the velocities that the policy asks for."""
+    if world.kinematics == "holonomic":
+        return {"kind": "holonomic"}
+    return {
+        "kind": "unicycle",
+        "turn_rate_limit_rad_s": math.radians(world.turn_rate_limit_deg_s),
+        "acceleration_limit_m_s2": world.acceleration_limit_m_s2,
+    }
+
+
 def metadata(config: RunConfig, weights: WeightsSnapshot, bare: bool) -> dict[str, Any]:
     """The metadata of an exported file, in addition to its inputs and outputs."""
     world = config.world
@@ -115,6 +127,7 @@ def metadata(config: RunConfig, weights: WeightsSnapshot, bare: bool) -> dict[st
         "decision_interval_steps": world.decision_interval_steps,
         "outer_radius_m": world.outer_radius_m,
         "shield": shield_numbers(world),
+        "kinematics": kinematic_numbers(world),
     }
     origin = {"run": config.name, "config_hash": config_hash(config), "updates": weights.version}
     settings = {"commit": git_commit(), "settings": to_dict(config)}

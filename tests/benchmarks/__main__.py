@@ -26,6 +26,7 @@ BENCHMARKS = (
     "foreign_envs",
     "senses",
     "shield",
+    "unicycle",
 )
 
 

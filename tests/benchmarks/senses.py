@@ -29,6 +29,7 @@ ALL = {
     "heading_error_deg": 5.0,
 }
 VARIANTS: dict[str, dict[str, Any]] = {
+    "without effect": {"sensing_range_m": 1e6},
     "noise": {"position_noise_m": 0.05},
     "loss": LOST,
     "delay": {"position_delay_steps": 4},
@@ -76,4 +77,4 @@ def main(methods: tuple[str, ...] = ("sensor", "in", "out")) -> None:
     """Prints a table for each method."""
     with pinned(max(os.sched_getaffinity(0))):
         for method in methods:
-            Console(width=140).print(table(method))
+            Console(width=160).print(table(method))

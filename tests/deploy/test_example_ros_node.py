@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import runpy
@@ -209,6 +210,28 @@ def test_robots_that_are_not_sensed_are_left_out(monkeypatch: pytest.MonkeyPatch
 def test_it_refuses_what_it_cannot_drive(monkeypatch: pytest.MonkeyPatch, played: Played, tmp_path: Path):
     with pytest.raises(SystemExit, match="name a goal"):
         start(monkeypatch, played, goals=[1.0, 2.0])
+
+
+def test_a_unicycle_gets_speed_and_turn_rate(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory):
+    """Driven by them from where it faces, it moves as the unicycle in the simulator does."""
+    world = dataclasses.replace(
+        WORLDS["sensor"], kinematics="unicycle", turn_rate_limit_deg_s=90.0, acceleration_limit_m_s2=100.0
+    )
+    played = Played(world, tmp_path_factory.mktemp("unicycle"))
+    ros = start(monkeypatch, played)
+    episode = played.episode
+    away = played.goals[0] - episode.position[0, episode.learner]
+    yaw, found, turned = math.atan2(away[1], away[0]), [], []
+    for step in range(len(episode.action) - 1):
+        say_state(ros, played, step, yaw)
+        ros.tick()
+        command = ros.published[-1]
+        assert command.linear.y == 0.0 and abs(command.angular.z) <= math.radians(90.0) + 1e-9
+        yaw += command.angular.z * world.time_step_s
+        found.append(command.linear.x * np.array([math.cos(yaw), math.sin(yaw)]))
+        turned.append(command.angular.z)
+    np.testing.assert_allclose(found, expected(episode), atol=1e-4)
+    assert np.ptp(turned) > 1.0
 
 
 def write_bag(path: Path, played: Played) -> None:
