@@ -100,7 +100,8 @@ def total(player: str, results: list[Result]) -> Total:
 
 def driven_store(folder: RunFolder, world: WorldConfig, seed: int) -> Path:
     """Where the episode that a person drove on a scene of this world is stored."""
-    return folder.artifacts / "driven" / config_hash(RunConfig(world=world)) / f"episode-{seed}.zarr"
+    alone = replace(world, learners=ONE_LEARNER)
+    return folder.artifacts / "driven" / config_hash(RunConfig(world=alone)) / f"episode-{seed}.zarr"
 
 
 def load_driven(folder: RunFolder, world: WorldConfig, seed: int) -> Episode:
