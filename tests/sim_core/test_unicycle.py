@@ -153,6 +153,27 @@ def test_a_saved_batch_goes_on_as_the_one_that_was_not_saved(method):
             np.testing.assert_array_equal(worlds.reset(ended), restored.reset(ended))
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_every_learning_robot_of_a_world_is_one(method):
+    """Each row against an oracle of its own, while others of its world end and FL-ORCA takes them over."""
+    worlds = make(2, method, learners="2", swarm_knows_learner="yes")
+    assert worlds.num_rows == 12
+    rows = np.arange(12)
+    goal = worlds.goals()[rows // 6, worlds.state.group[worlds.state.learner]]
+    away = goal - worlds.positions()[rows // 6, worlds.state.learner]
+    oracles = [Oracle(math.atan2(y, x), worlds.config) for x, y in away.astype(float)]
+    rng, running, checked = np.random.default_rng(1), np.ones(12, bool), 0
+    for _ in range(40):
+        asked = rng.uniform(-0.7, 0.7, (2, 12)).astype(np.float32)
+        worlds.step(Command(asked))
+        velocity = np.stack([worlds.state.vel_x, worlds.state.vel_y], axis=-1)[rows // 6, worlds.state.learner]
+        expected = np.array([oracle.drive(*map(float, v)) for oracle, v in zip(oracles, asked.T, strict=True)])
+        np.testing.assert_allclose(velocity[running], expected[running], atol=2e-6)
+        checked += running.sum()
+        running &= worlds.outcome == Outcome.RUNNING
+    assert checked > 100
+
+
 @settings(max_examples=20, deadline=None, derandomize=True)
 @given(
     method=st.sampled_from(METHODS),
