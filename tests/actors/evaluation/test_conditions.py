@@ -11,6 +11,7 @@ def test_values_have_the_type_of_their_field():
     assert parse_axis("position_loss=0,0.5") == Axis("position_loss", (0.0, 0.5))
     assert parse_axis("dropped_mates=0,2") == Axis("dropped_mates", (0, 2))
     assert parse_axis("shield=none,orca") == Axis("shield", ("none", "orca"))
+    assert parse_axis("kinematics=holonomic,unicycle") == Axis("kinematics", ("holonomic", "unicycle"))
     assert all(type(value) is float for value in parse_axis("position_loss=0,1").values)
 
 
@@ -48,6 +49,10 @@ def test_a_world_is_under_the_condition_alone_whatever_it_was_trained_with():
     played = world_under(trained, {"position_delay_steps": 4})
     assert played == WorldConfig(position_delay_steps=4, shield="orca", robots=7)
     assert world_under(trained, {"shield": "none"}).shield == "none"
+    turning = WorldConfig(kinematics="unicycle", turn_rate_limit_deg_s=30.0)
+    assert world_under(turning, {"position_loss": 0.5}) == WorldConfig(
+        kinematics="unicycle", turn_rate_limit_deg_s=30.0, position_loss=0.5
+    )
     plain = WorldConfig()
     assert world_under(trained, {}) == WorldConfig(shield="orca", robots=7)
     assert all(getattr(world_under(trained, {}), name) == getattr(plain, name) for name in CONDITIONS)
