@@ -1,4 +1,4 @@
-"""Starts a run's components under its engine: as Ray actors, or in this process."""
+"""Starts a run's components under its engine: as Ray actors, or in this process, which then needs no Ray."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from actors.service.rpc import Calls, LocalCalls
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig
-from learner.ray_backend.cluster import RayCluster, task_calls
 from learner.training.cluster import Cluster, ProcessCluster
 from sim_core.checks import ConfigError
 
@@ -19,6 +18,8 @@ def open_cluster(config: RunConfig, incarnation: int, options: ClusterOptions) -
     """Starts the run's components under its engine."""
     if config.engine == "process":
         return ProcessCluster(config, incarnation)
+    from learner.ray_backend.cluster import RayCluster
+
     return RayCluster(config, incarnation, options)
 
 
@@ -33,8 +34,10 @@ def open_early(config: RunConfig, options: ClusterOptions, imports: str) -> Clus
     """
     if config.engine == "process":
         return None
+    from learner.ray_backend.cluster import RayCluster  # before the thread, which would wait for what both import
+
     threading.Thread(target=importlib.import_module, args=(imports,)).start()
-    return open_cluster(config, 0, options)
+    return RayCluster(config, 0, options)
 
 
 @contextmanager
@@ -54,5 +57,7 @@ def open_calls(config: RunConfig, options: ClusterOptions) -> Iterator[tuple[Cal
     if config.engine == "process":
         yield LocalCalls(), 1
     else:
+        from learner.ray_backend.cluster import task_calls
+
         with task_calls(options.address) as calls:
             yield calls

@@ -33,7 +33,6 @@ from learner.config import RunConfig
 from learner.engine import open_calls, open_cluster
 from learner.file_names import CONFIG
 from learner.loop import TrainingLoop
-from learner.ray_backend.metrics import RayMetrics
 from learner.run_end import EndState, RunEnd, discard_end, final_seeds
 from learner.run_folder import RunFolder
 from learner.tracking.delivery import Delivery, retry
@@ -316,7 +315,11 @@ class RunSession:
     @cached_property
     def _monitor(self) -> Callable[[Row], None]:
         """Exports rows to Prometheus; made once this process has joined Ray."""
-        return RayMetrics(self._folder.path.name).row if self._config.engine == "ray" else lambda row: None
+        if self._config.engine == "process":
+            return lambda row: None
+        from learner.ray_backend.metrics import RayMetrics
+
+        return RayMetrics(self._folder.path.name).row
 
     def _say(self, text: str) -> None:
         """Shows a line about MLflow, whose errors contain its address, without the address's password."""

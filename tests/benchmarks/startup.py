@@ -134,7 +134,7 @@ def recover() -> float:
                 [*order, "--runs-dir", str(run.parent)], env=environment(HERE), stdout=log, stderr=log
             )
         try:
-            while not list((run / CHECKPOINTS).glob("step-*")):
+            while not list((run / CHECKPOINTS).glob("step-*[0-9]")):
                 time.sleep(POLL_S)
             (driver,) = psutil.Process(child.pid).children()
             driver.kill()
@@ -211,12 +211,12 @@ def mean_counts(counts: list[Counter[str]]) -> dict[str, float]:
     return {kind: sum(count[kind] for count in counts) / len(counts) for kind in set().union(*counts)}
 
 
-def main(against: Path | None = None) -> None:
+def main(against: Path | None = None, rounds: int = ROUNDS) -> None:
     checkouts, findings = [HERE, *([against.resolve()] if against else [])], Findings()
     other = checkouts[1] if against else None
     for checkout in checkouts:
         train(checkout, "process")  # compiles the kernels, and Python's modules
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         for checkout in checkouts:
             findings.measure(checkout)
         findings.seconds[HERE][RECOVERED].append(recover())

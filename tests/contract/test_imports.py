@@ -42,10 +42,10 @@ PROCESSES = {
     "an environment": (ENVIRONMENT, MEASURED - KERNELS),
     "a rollout worker": (WORKER, MEASURED - KERNELS - {"ray", "zarr"}),
     "the learner": (LEARNER, MEASURED - KERNELS - {"torch", "ray", "zarr"}),
-    "the driver": ("import deploy.training", MEASURED - KERNELS - {"ray", "mlflow", "zarr", "pandas"}),
+    "the driver": ("import deploy.training", MEASURED - KERNELS - {"mlflow", "zarr", "pandas"}),
     "the driver before it opens MLflow's store": (
         "import deploy.commands.train",
-        MEASURED - KERNELS - {"ray", "zarr"},
+        MEASURED - KERNELS - {"zarr"},
     ),
 }
 """A program for each kind of process, and what it may not import."""
