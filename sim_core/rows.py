@@ -54,9 +54,10 @@ def draw_learners(state, mask, scene_learner, counts):
 
 @kernel
 def begin_decision(outcome, running, is_running):
-    """Sets which rows and worlds run: rows that have not ended, or all rows of a world where all have.
+    """Sets which rows and worlds run: rows that have not ended, and worlds that have such rows.
 
-    A world that has ended and is not restarted goes on as if it had not.
+    A world that has ended and is not restarted stays as it ended; that of a single learning robot goes on as if it had
+    not.
 
     Args:
       outcome: `[num_rows]` int8.
@@ -65,13 +66,11 @@ def begin_decision(outcome, running, is_running):
     """
     per_world = running.shape[0] // is_running.shape[0]
     for world in range(is_running.shape[0]):
-        first, any_runs = world * per_world, False
-        for row in range(first, first + per_world):
-            running[row] = outcome[row] == _RUNNING
+        any_runs = False
+        for row in range(world * per_world, (world + 1) * per_world):
+            running[row] = outcome[row] == _RUNNING or per_world == 1
             any_runs |= running[row]
-        if not any_runs:
-            running[first : first + per_world] = True
-        is_running[world] = True
+        is_running[world] = any_runs
 
 
 @kernel
@@ -146,15 +145,18 @@ class RowView:
         copies = {name: np.repeat(getattr(state, name), self._per_world, axis=0) for name in self._copied}
         self.state = state._replace(**copies)
 
-    def refresh(self) -> None:
-        """Copies the worlds as they are now."""
+    def refresh(self, mask: NDArray[np.bool_]) -> None:
+        """Copies the worlds as they are now, where `mask` `[num_rows]` is set; other rows stay as they were."""
+        of_worlds = mask.reshape(-1, self._per_world)
         for name in self._copied:
             array, copy = getattr(self._worlds, name), getattr(self.state, name)
-            copy.reshape(len(array), self._per_world, *array.shape[1:])[:] = array[:, None]
-        _spread(self.state.rng, self._per_world)
+            where = of_worlds.reshape(*of_worlds.shape, *(1 for _ in array.shape[1:]))
+            np.copyto(copy.reshape(len(array), self._per_world, *array.shape[1:]), array[:, None], where=where)
+        _spread(self.state.rng, mask, self._per_world)
 
 
 @kernel
-def _spread(rng, per_world):
+def _spread(rng, mask, per_world):
     for row in range(rng.shape[0]):
-        rng[row] = bits_at(rng[row], ROW_STREAM + row % per_world)
+        if mask[row]:
+            rng[row] = bits_at(rng[row], ROW_STREAM + row % per_world)

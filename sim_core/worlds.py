@@ -147,7 +147,7 @@ class WorldBatch:
             draw_learners(self.state, mask, self._scene_state.learner, self._counts)
         reset_episode(self.state, mask)
         self.outcome[rows] = int(Outcome.RUNNING)
-        self._refresh()
+        self._refresh(rows)
         if self._senses is not None:
             self._senses.begin(rows)
         if self._unicycle is not None:
@@ -165,9 +165,10 @@ class WorldBatch:
         """The worlds `[num_worlds]` whose learning robots' episodes have all ended."""
         return np.asarray(is_done(self.outcome).reshape(self.num_worlds, -1).all(axis=1))
 
-    def _refresh(self) -> None:
+    def _refresh(self, rows: NDArray[np.bool_]) -> None:
+        """Brings what `sensed` and method are told of the world up to date for rows that run; others stay as ended."""
         if self._view is not None:
-            self._view.refresh()
+            self._view.refresh(rows)
 
     def observation(self) -> NDArray[Any]:
         """What the policy sees `[num_rows, size]`, a copy: with a history, the newest observation first.
@@ -237,7 +238,7 @@ class WorldBatch:
         is_given = self._give_command(action)
         command_x, command_y = self._command
         advance(self.state, self.tile, is_running, running, command_x, command_y, is_given, self.swarm)
-        self._refresh()
+        self._refresh(running)
         self.method.outcome(self._known, running, self.outcome)
         self.method.reward(self._known, running, self.outcome, self.step_reward)
         if self._senses is not None:
@@ -303,7 +304,7 @@ class WorldBatch:
     def swarm_step(self) -> None:
         """Moves every world by one simulator step, the learning robot too, and nothing else: no outcome, no reward."""
         advance(self.state, self.tile, self._all, self._all_rows, *self._command, False, self.swarm)
-        self._refresh()
+        self._refresh(self._all_rows)
 
     def segregation(self) -> NDArray[np.float64]:
         """The fraction `[num_worlds]` of the pairs of groups that are segregated (Eq. 3.1)."""
@@ -349,8 +350,8 @@ class WorldBatch:
                 raise ValueError(f"saved worlds do not fit: {name} should be {array.dtype}{array.shape}")
         for name, array in arrays.items():
             array[...] = saved[name]
-        self._refresh()
         rows = ~is_done(self.outcome) if self._several else self._all_rows  # those that wait observe nothing
+        self._refresh(rows)
         self.method.perceive(self.sensed, rows, self._observation)
         return self.observation()
 

@@ -27,6 +27,7 @@ BENCHMARKS = (
     "senses",
     "shield",
     "unicycle",
+    "learners",
 )
 
 

@@ -1,6 +1,7 @@
 """Several learning robots a world: who learns, what each of them meets, when episodes and worlds end."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from sim_core.pilot import Pilot
 from sim_core.worlds import WorldBatch, is_done
 from tests.sim_core.segregation import segregated_fraction
 
+EXAMPLES = Path(__file__).parents[2] / "deploy" / "examples"
 SMALL = {"robots": 5, "groups": 2, "arena_radius_m": 2.0, "horizon_steps": 120}
 SEEDS = list(range(70, 76))
 METHODS = ("sensor", "in", "out")
@@ -139,7 +141,7 @@ def test_an_ended_robot_waits_as_it_ended_and_fl_orca_drives_it():
         was_over = is_done(worlds.outcome)
         state = worlds.get_state()
         result = worlds.step(action)
-        np.testing.assert_array_equal(result.decided, ~was_over | np.repeat(was_over.reshape(6, 10).all(1), 10))
+        np.testing.assert_array_equal(result.decided, ~was_over)
         for row in np.flatnonzero(was_over):
             for name in ("observation", "outcome", "steps", "episode_return"):
                 np.testing.assert_array_equal(getattr(result, name)[row], known[row][name])
@@ -158,6 +160,17 @@ def test_an_ended_robot_waits_as_it_ended_and_fl_orca_drives_it():
             worlds.reset(done)
             assert not is_done(worlds.outcome[np.repeat(done, 10)]).any()
     assert waited > 100
+
+
+def test_a_world_that_has_ended_and_is_not_restarted_stays_as_it_ended():
+    worlds = batch(learners=1.0, horizon_steps=7)
+    while not worlds.ended_worlds().all():
+        last = worlds.step(np.zeros(60, np.int64))
+    state, again = worlds.get_state(), worlds.step(np.ones(60, np.int64))
+    assert not again.decided.any() and not again.reward.any()
+    np.testing.assert_array_equal(again.outcome, last.outcome)
+    for name, array in worlds.get_state().items():
+        np.testing.assert_array_equal(array, state[name], err_msg=name)
 
 
 def test_the_horizon_ends_the_episodes_that_still_run():
@@ -251,6 +264,24 @@ def test_one_of_several_senses_as_one_alone_would(monkeypatch):
         single.state.rng[:] = several._view.state.rng[row]
         single._senses.begin(np.ones(1, np.bool_))
         np.testing.assert_array_equal(single.sensed_positions()[0], several.sensed_positions()[row])
+
+
+@pytest.mark.parametrize("ended", ["fl-orca", "leave"])
+def test_a_method_of_a_users_own_knows_one_learning_robot_and_serves_several(ended):
+    """The example in plain numpy gives what its twin with a kernel gives, and what it gives a robot alone."""
+    examples = {"compass.py": "Compass", "compass_kernel.py": "FastCompass"}
+    plain, fast = (
+        batch(method=f"{EXAMPLES / file}:{name}", learners=1.0, ended_learners=ended) for file, name in examples.items()
+    )
+    alone = batch(method=f"{EXAMPLES / 'compass.py'}:Compass")
+    row = np.flatnonzero(plain.state.learner[:10] == alone.state.learner[0])[0]
+    np.testing.assert_array_equal(plain.observation()[row], alone.observation()[0])
+    for action in np.random.default_rng(12).integers(0, 8, (60, 60)):
+        one, other = plain.step(action), fast.step(action)
+        np.testing.assert_allclose(one.observation, other.observation, atol=1e-5)
+        np.testing.assert_array_equal(one.outcome, other.outcome)
+        np.testing.assert_array_equal(one.reward, other.reward)
+    assert (~one.decided).any()
 
 
 def test_fl_orca_drives_several_learning_robots_as_the_swarm():

@@ -1,0 +1,125 @@
+"""What a learning robot costs where more robots of a world learn: its transitions, made by one rollout worker.
+
+The robots of a world share the simulator's step; a robot that learns alone has a whole step to itself. `cost` is the
+CPU time of a transition over that of the single learning robot of the same setup, with equally many worlds. First of a
+whole rollout worker, whose network has random weights: most robots soon collide, and wait for their world's end (the
+share that does not is `decide`). Then of the worlds' steps alone, which FL-ORCA drives, so that robots arrive.
+"""
+
+import os
+import time
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from actors.policy.policy import WeightsSnapshot
+from actors.rollout.env_spec import EnvSpec
+from actors.rollout.vector_env import env_shape
+from actors.rollout.worker import RolloutSettings, RolloutWorker
+from sim_core import ENV_ID
+from sim_core.config import ONE_LEARNER, WorldConfig
+from sim_core.pilot import Pilot
+from sim_core.worlds import WorldBatch
+from tests.benchmarks.timing import Timed, pinned, ratio, spread, timed_rates
+
+ROUNDS, BLOCK_STEPS = 7, 32
+SETUPS = ((10, 2, 64), (10, 4, 64), (25, 8, 8))
+"""Robots per group, groups, worlds."""
+SHARES = (ONE_LEARNER, "0.25", "0.5", "1.0")
+HIDDEN = (128, 128)
+"""Of the default network."""
+EPSILON = 0.05
+WORLD: dict[str, Any] = {
+    "max_neighbours": 16,
+    "orca_radius_m": 0.18,
+    "robot_radius_m": 0.06,
+    "swarm_knows_learner": "yes",
+}
+
+
+class _Blocks:
+    """Blocks of a rollout worker whose network has random weights; what is counted are the transitions in them.
+
+    Attributes:
+      deciding: share of the robots that decided in the last block.
+    """
+
+    def __init__(self, config: WorldConfig, worlds: int) -> None:
+        spec = EnvSpec(ENV_ID, config)
+        shape, rng, arrays = env_shape(spec), np.random.default_rng(0), list[Any]()
+        sizes = (shape.observation_size, *HIDDEN, shape.num_actions)
+        for fan_in, fan_out in zip(sizes, sizes[1:], strict=False):
+            arrays += [rng.normal(0, fan_in**-0.5, (fan_out, fan_in)).astype(np.float32), np.zeros(fan_out, np.float32)]
+        settings = RolloutSettings(spec, worlds * config.num_learners, BLOCK_STEPS, 3, 0.99, 0)
+        self._worker, self._most, self.deciding = RolloutWorker(settings, 0, 0), settings.num_envs * BLOCK_STEPS, 1.0
+        self._worker.set_weights(WeightsSnapshot(0, 0.0, tuple(arrays)))
+        for _ in range(8):  # compiles; worlds are then in all parts of their episodes
+            self._worker.collect(EPSILON)
+
+    def __call__(self) -> Timed:
+        start_s = time.process_time()  # of this process alone: others may use the core, too
+        block = self._worker.collect(EPSILON)
+        seconds = time.process_time() - start_s
+        self.deciding = block.header.env_steps / self._most
+        return Timed(block.transitions, seconds)
+
+
+class _Steps:
+    """Steps of worlds in which FL-ORCA drives the learning robots; what is counted are decisions."""
+
+    def __init__(self, config: WorldConfig, worlds: int) -> None:
+        self._worlds = WorldBatch(config, worlds)
+        self._worlds.reset()
+        self()
+
+    def __call__(self) -> Timed:
+        count, seconds = 0, 0.0
+        for _ in range(BLOCK_STEPS):
+            start_s = time.process_time()
+            result = self._worlds.step(Pilot.FREE)
+            seconds += time.process_time() - start_s
+            count += int(np.count_nonzero(result.decided))
+            ended = self._worlds.ended_worlds()
+            if ended.any():
+                self._worlds.reset(ended)
+        return Timed(count, seconds)
+
+
+def table(method: str) -> Table:
+    """Transitions a second and their cost, for every setup and share of learning robots."""
+    result = Table(title=f"{method}: one rollout worker, network {HIDDEN}; median (range) of {ROUNDS}")
+    for name in (
+        "setup",
+        "learners",
+        "of a world",
+        "decide",
+        "transitions/s",
+        "cost",
+        "steps alone, decisions/s",
+        "cost",
+    ):
+        result.add_column(name, justify="right")
+    for robots, groups, worlds in SETUPS:
+        setup: dict[str, Any] = {"method": method, "robots": robots, "groups": groups, **WORLD}
+        configs = {share: WorldConfig(learners=share, **setup) for share in SHARES}
+        blocks = {share: _Blocks(config, worlds) for share, config in configs.items()}
+        made = timed_rates(blocks, ROUNDS)
+        stepped = timed_rates({share: _Steps(config, worlds) for share, config in configs.items()}, ROUNDS)
+        for share, config in configs.items():
+            row = [config.setup if share == ONE_LEARNER else "", share, str(config.num_learners)]
+            row.append(f"{100 * blocks[share].deciding:.0f} %")
+            for rates in (made, stepped):
+                cost = ratio(rates[ONE_LEARNER], rates[share]).text(2) if share != ONE_LEARNER else "1"
+                row += [f"{spread(rates[share]).median:,.0f}", cost]
+            result.add_row(*row)
+        result.add_section()
+    return result
+
+
+def main(methods: tuple[str, ...] = ("sensor", "in", "out")) -> None:
+    """Prints a table for each method."""
+    with pinned(max(os.sched_getaffinity(0))):
+        for method in methods:
+            Console(width=140).print(table(method))
