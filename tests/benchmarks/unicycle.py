@@ -29,10 +29,10 @@ LIMITS = ((360.0, 4.0), (180.0, 2.0), (90.0, 1.0))
 SETUPS = [(robots, groups) for robots in ROBOTS for groups in GROUPS]
 
 
-def goals(
+def outcomes(
     method: str, player: Baseline, limits: tuple[float, float] | None, episodes: int, setup: tuple[int, int]
 ) -> np.ndarray:
-    """Successes `[episodes]` in a setup; without limits, of the holonomic robot."""
+    """Outcomes `[episodes]` in a setup; without limits, of the holonomic robot."""
     world = preset_config("best", method, *setup).world
     if limits is not None:
         turn, acceleration = limits
@@ -40,28 +40,33 @@ def goals(
             world, kinematics="unicycle", turn_rate_limit_deg_s=turn, acceleration_limit_m_s2=acceleration
         )
     seeds = list(range(FIRST_SEED, FIRST_SEED + episodes))
-    return evaluate(EnvSpec(ENV_ID, world), player, seeds).outcome == Outcome.GOAL
+    return evaluate(EnvSpec(ENV_ID, world), player, seeds).outcome
 
 
 def main(episodes: int = 8) -> None:
     """Prints a row for each method and who drives: success without limits, and with them, paired."""
     table = Table(title=f"success in the worlds of best, 25 setups of {episodes} episodes from seed {FIRST_SEED:,}")
-    for name in ("method", "drives", "holonomic", *(f"{turn:.0f}°/s, {a:.0f} m/s²: paired" for turn, a in LIMITS)):
+    limited = [f"{turn:.0f}°/s, {a:.0f} m/s²" for turn, a in LIMITS]
+    for name in ("method", "drives", "holonomic", *limited, f"collide at {limited[-1]}"):
         table.add_column(name, justify="right")
     with ProcessPoolExecutor() as pool:
         for method in METHODS:
             for player in PLAYERS:
                 played = [
-                    np.concatenate(list(pool.map(functools.partial(goals, method, player, limits, episodes), SETUPS)))
+                    np.concatenate(
+                        list(pool.map(functools.partial(outcomes, method, player, limits, episodes), SETUPS))
+                    )
                     for limits in (None, *LIMITS)
                 ]
-                cells = [as_percent(rate(int(played[0].sum()), len(played[0])))]
-                for found in played[1:]:
-                    value, low, high = (100 * x for x in paired_comparison(played[0], found).difference)
-                    cells.append(f"{100 * found.mean():.1f} %: {value:+.1f} ({low:+.1f} … {high:+.1f})")
-                table.add_row(method, str(player), *cells)
+                goals = [found == Outcome.GOAL for found in played]
+                cells = [as_percent(rate(int(goals[0].sum()), len(goals[0])))]
+                for reached in goals[1:]:
+                    value, low, high = (100 * x for x in paired_comparison(goals[0], reached).difference)
+                    cells.append(f"{100 * reached.mean():.1f} %: {value:+.1f} ({low:+.1f} … {high:+.1f})")
+                collided = int((played[-1] == Outcome.COLLISION).sum())
+                table.add_row(method, str(player), *cells, as_percent(rate(collided, len(played[-1]))))
             table.add_section()
-    Console(width=150).print(table)
+    Console(width=170).print(table)
 
 
 if __name__ == "__main__":
