@@ -18,6 +18,7 @@ from actors.evaluation.evaluator import record_episode
 from actors.evaluation.result_table import read_table, write_table
 from deploy.cli import main
 from deploy.commands.dashboard import report_server
+from deploy.drive import DrivenRun
 from deploy.live import live_server
 from deploy.report_data.sources import find_report_source
 from deploy.runs.policy_lookup import find_policy
@@ -231,12 +232,29 @@ def test_live_waits_for_the_first_checkpoint(browser, trained, tmp_path):
         assert read(f"{url}episode.json?number=2")["setup"].endswith("seed 9")
 
 
+def test_what_was_driven_is_drawn_and_what_was_not_is_refused(trained, tmp_path, capsys):
+    run = RunFolder(shutil.copytree(trained.path, tmp_path / "r"))
+    config = run.config()
+    picture = ["watch", str(run.path), "--drive", "--format", "png", "--seed", "41"]
+    assert main(picture) == 2
+    assert "nobody has driven scene 41" in capsys.readouterr().err
+    driven = DrivenRun(run, config.world, find_policy(run, config), 40)
+    driven.begin({"number": 1})
+    step, outcome = 0, "running"
+    while outcome == "running":
+        made = driven.move({"step": step, "x": 1, "y": 0})
+        step, outcome = step + len(made["positions"]), made["outcome"]
+    assert main(picture) == 0
+    assert f"{step} env steps, outcome {outcome}" in capsys.readouterr().out
+    assert (run.artifacts / "driven-41.png").stat().st_size > 1_000
+
+
 def listen_to_ctrl_c():
     """As in a terminal: what a script starts in the background, as it may these tests, ignores it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-@pytest.mark.parametrize("command", [["dashboard", "--serve"], ["watch", "--live"]])
+@pytest.mark.parametrize("command", [["dashboard", "--serve"], ["watch", "--live"], ["watch", "--drive"]])
 def test_ctrl_c_ends_a_server(trained, tmp_path, command):
     arguments = [command[0], str(trained.path), command[1], "--port", "0"]
     with subprocess.Popen(
@@ -270,6 +288,8 @@ def test_ctrl_c_ends_a_server(trained, tmp_path, command):
         (["dashboard", "bad.csv", "--episodes", "-1"], ["--episodes", "negative"]),
         (["watch", "r", "--live", "--format", "mp4"], ["--live", "--format"]),
         (["watch", "nobody", "--live"], ["nobody"]),
+        (["watch", "r", "--live", "--drive"], ["--live", "--drive", "one of them"]),
+        (["watch", "r", "--drive", "--out", "x.html"], ["--drive", "--out", "--format"]),
     ],
 )
 def test_bad_input_is_refused_in_a_sentence(capsys, tmp_path, monkeypatch, arguments, words):
