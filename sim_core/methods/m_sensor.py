@@ -126,7 +126,7 @@ class SensorMethod(Method):
     presets = {
         "thesis": Preset({"n_step": 1, "samples_per_insert": 1.5}, WORLD),
         "best": Preset({}, BEST_WORLD),
-        "generalist": Preset({}, BEST_WORLD),
+        "generalist": Preset({"discount": 0.985, "policy_average_updates": 1_000, "random_turns": True}, BEST_WORLD),
     }
     robot_module = "learner.export.m_sensor:SensorRobot"
 
