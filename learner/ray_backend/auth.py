@@ -29,7 +29,10 @@ def has_token() -> bool:
     """Whether Ray would find a token: in RAY_AUTH_TOKEN, in the file RAY_AUTH_TOKEN_PATH, or in ~/.ray/auth_token."""
     path = os.environ.get("RAY_AUTH_TOKEN_PATH")
     file = Path(path or os.path.expanduser("~/.ray/auth_token"))  # a user without a home has none
-    return bool(os.environ.get(TOKEN)) or file.is_file()
+    try:
+        return bool(os.environ.get(TOKEN)) or file.is_file()
+    except PermissionError:  # the folder is another user's, and so is what lies in it
+        return False
 
 
 def guard_ray(joins: bool) -> None:

@@ -67,7 +67,8 @@ def seconds_of(checkout: Path, *arguments: str) -> float:
     """Seconds of a whole process of Python."""
     start_s = time.perf_counter()
     order = [sys.executable, *arguments]
-    subprocess.run(order, check=True, env=environment(checkout), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    here = {"cwd": checkout, "env": environment(checkout)}  # Python looks for modules in the present folder first
+    subprocess.run(order, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **here)
     return time.perf_counter() - start_s
 
 
@@ -99,6 +100,7 @@ def train(checkout: Path, engine: str, **more: str) -> Training:
         start_s, lines = time.time(), list[tuple[float, str]]()
         child = subprocess.Popen(
             [*order, "--runs-dir", str(run.parent)],
+            cwd=checkout,
             env=environment(checkout, **more),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

@@ -169,11 +169,15 @@ def shared() -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
+WHEN_NEEDED = ("deploy.runs.artifacts", "learner.export.policy_file", "learner.ray_backend.cluster")
+"""Modules that functions import once they need them."""
+
+
 @contextlib.contextmanager
 def as_another_user(runs: Path, hidden: list[Path]) -> Iterator[None]:
     """Acts as a user who may read everything but `hidden`, and write nothing there; an administrator becomes nobody."""
-    for name in ("evaluate", "resume", "watch"):
-        importlib.import_module(f"deploy.commands.{name}")  # nobody may not read the administrator's Python
+    for name in ("deploy.commands.evaluate", "deploy.commands.resume", "deploy.commands.watch", *WHEN_NEEDED):
+        importlib.import_module(name)  # nobody may not read the administrator's Python
     before = {path: path.stat().st_mode for path in [runs, *runs.rglob("*")]}
     for path, mode in reversed(before.items()):
         path.chmod(0 if path in hidden else mode & ~0o222 | 0o444)
