@@ -6,11 +6,12 @@ RUNTIME := $(VENV)/.runtime-ready
 READY := $(VENV)/.dev-ready
 RLLIB := $(VENV)/rllib
 PIP := -m pip install --quiet --disable-pip-version-check --no-compile
+VMAS := vmas==1.5.2 gym==0.26.2 gym-notices==0.0.8 six==1.17.0 pyglet==1.5.27
 INSTALL := $(PIP) --constraint .ci/constraints.txt --editable
 # Python compiles the modules that it imports, once. pip would compile all, which takes longer than a first training saves.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: train test lint style types kernels constraints bench bench-peers bench-exactness reproduce generalist fuzz soak setup clean
+.PHONY: train test lint style types kernels constraints bench bench-peers bench-robots bench-exactness reproduce generalist shares fuzz soak setup clean
 
 setup: $(READY)
 
@@ -64,6 +65,14 @@ bench: $(READY)
 bench-peers: $(VENV)/.peers $(RLLIB)/.ready
 	$(BIN)/python -m tests.benchmarks.peers --rllib $(RLLIB)/bin/python $(ARGS)
 
+# Steps of learning robots beside VMAS, which lives in a folder of its own, since it needs Gymnasium's predecessor.
+bench-robots: $(VENV)/vmas/.ready
+	$(BIN)/python -W ignore -m tests.benchmarks.robot_peers --vmas $(VENV)/vmas
+
+$(VENV)/vmas/.ready: $(READY)
+	$(BIN)/python $(PIP) --no-deps --target $(VENV)/vmas $(VMAS)
+	touch $@
+
 $(VENV)/.peers: $(READY)
 	$(BIN)/python $(INSTALL) '.[dev,peers]'
 	touch $@
@@ -85,6 +94,11 @@ reproduce: $(READY)
 # ARGS="--methods sensor --seeds 0" for one.
 generalist: $(READY)
 	$(BIN)/python -m tests.benchmarks.generalist $(ARGS)
+
+# One robot, a quarter, half or all of a swarm learn, and each policy plays at every share; half a minute a training.
+# ARGS="--methods sensor --setups 10x2 --seeds 0" for some.
+shares: $(READY)
+	$(BIN)/python -m tests.benchmarks.shares $(ARGS)
 
 # Over ten thousand random command lines and config files, and 2,000 environments. ARGS="--share 0.1" for some,
 # ARGS="--seed 1" for others, ARGS="--kinds environments" for one kind.

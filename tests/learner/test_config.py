@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from learner.config import AT_LEAST_ONE, RunConfig, config_hash, from_dict, to_dict
+from learner.config import AT_LEAST_ONE, RunConfig, config_hash, from_dict, identity_dict, to_dict
 from learner.training.cluster import rollout_settings
 from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
@@ -249,3 +249,23 @@ def test_the_hash_depends_on_every_field_but_length_and_placement(small_run, nam
 def test_the_hash_is_stable(small_run):
     assert config_hash(small_run) == config_hash(from_dict(to_dict(small_run)))
     assert len(config_hash(small_run)) == 12 and int(config_hash(small_run), 16) >= 0
+
+
+def test_hashes_do_not_know_of_several_learning_robots_where_one_learns():
+    """Runs from before there were several keep their hashes."""
+    plain = RunConfig()
+    assert not {"learners", "ended_learners"} & identity_dict(plain)["world"].keys()
+    several = dataclasses.replace(plain, world=WorldConfig(learners="1.0"))
+    leaving = dataclasses.replace(plain, world=WorldConfig(learners="1.0", ended_learners="leave"))
+    assert len({config_hash(config) for config in (plain, several, leaving)}) == 3
+    assert identity_dict(leaving)["world"]["ended_learners"] == "leave"
+
+
+def test_a_learning_robot_is_an_environment():
+    several = RunConfig(world=WorldConfig(robots=10, groups=2, learners="1.0"), envs_per_worker=64)
+    assert several.block_env_steps == 60 * several.steps_per_block  # three worlds of 20
+    assert several.title == "sensor 10r×2g, learners 1.0" and RunConfig().title == "sensor 10r×2g"
+    large = RunConfig(world=WorldConfig(robots=25, groups=8, learners="1.0"), envs_per_worker=64)
+    assert large.block_env_steps == 200 * large.steps_per_block  # a world at least
+    mixed = RunConfig(world=WorldConfig(learners="0.5"), setups=("10x2", "5x2"), envs_per_worker=64)
+    assert mixed.block_env_steps == (30 + 30) * mixed.steps_per_block  # worlds of 10 and of 6
