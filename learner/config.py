@@ -442,8 +442,15 @@ def from_dict(values: dict[str, Any]) -> RunConfig:
     return RunConfig(**plain)
 
 
-UNCOUNTED = {"learners": ONE_LEARNER, "ended_learners": "fl-orca"}
-"""World settings that hashes leave out at these values: runs from before there were such settings keep their hashes."""
+UNCOUNTED = {
+    "discount_time_s": 0.0,
+    "learners": ONE_LEARNER,
+    "ended_learners": "fl-orca",
+    "kinematics": "holonomic",
+    "turn_rate_limit_deg_s": 180.0,
+    "acceleration_limit_m_s2": 2.0,
+}
+"""Settings that hashes leave out at these values: runs from before there were such settings keep their hashes."""
 
 
 def identity_dict(config: RunConfig) -> dict[str, Any]:
@@ -451,9 +458,9 @@ def identity_dict(config: RunConfig) -> dict[str, Any]:
     values = to_dict(config)
     for kind in (METHODS, SCENES):
         values["world"][kind.setting] = identity(kind, values["world"][kind.setting])
-    for name, default in UNCOUNTED.items():
-        if values["world"][name] == default:
-            del values["world"][name]
+    for section in (values, values["world"]):
+        for name in [name for name, default in UNCOUNTED.items() if section.get(name) == default]:
+            del section[name]
     values["world"]["sources"] = tuple((os.path.basename(path), text) for path, text in config.world.sources)
     return values
 

@@ -246,6 +246,11 @@ def test_the_hash_depends_on_every_field_but_length_and_placement(small_run, nam
     assert same == (name in ("total_env_steps", "engine", "device"))
 
 
+def test_settings_that_were_added_leave_earlier_hashes_as_they_were():
+    assert config_hash(RunConfig()) == "7692f3056dac"  # of the version before UNCOUNTED's settings
+    assert config_hash(RunConfig(seed=3)) == "d8903ec0579d"
+
+
 def test_the_hash_is_stable(small_run):
     assert config_hash(small_run) == config_hash(from_dict(to_dict(small_run)))
     assert len(config_hash(small_run)) == 12 and int(config_hash(small_run), 16) >= 0
