@@ -140,7 +140,7 @@ class WorldBatch:
         Returns:
           Observations of all worlds, a copy.
         """
-        mask = self._all if mask is None else mask
+        mask = self._all if mask is None else np.ascontiguousarray(mask)  # as kernels of `for_types_of` read it
         rows = self.rows_of(mask)
         self.scene.start(self._scene_state, mask)
         if self._several:
@@ -211,7 +211,7 @@ class WorldBatch:
                 watch()
             if left and not any_running:
                 break
-        self._perceive(unseen)
+        self._perceive(unseen, decided)
         return StepResult(
             self.observation(),
             self._reward.copy(),
@@ -221,11 +221,11 @@ class WorldBatch:
             decided,
         )
 
-    def _perceive(self, rows: NDArray[np.bool_]) -> None:
-        self.method.perceive(self.sensed, rows, self._observation)
+    def _perceive(self, unseen: NDArray[np.bool_], decided: NDArray[np.bool_]) -> None:
+        self.method.perceive(self.sensed, unseen, self._observation)
         if self.config.history > 1:
-            self._history[:, 1:] = self._history[:, :-1].copy()
-            self._history[:, 0] = self._observation
+            newest_first = [self._observation[:, None], self._history[:, :-1]]
+            np.copyto(self._history, np.concatenate(newest_first, axis=1), where=decided[:, None, None])
 
     def _simulate(self, action: Decision, unseen: NDArray[np.bool_]) -> bool:
         """Moves the running worlds by one simulator step and adds its rewards; returns whether any still runs.

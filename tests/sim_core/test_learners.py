@@ -133,8 +133,9 @@ def test_a_batch_equals_its_worlds_one_by_one(method):
     np.testing.assert_array_equal(together.positions(), np.concatenate([worlds.positions() for worlds in alone]))
 
 
-def test_an_ended_robot_waits_as_it_ended_and_fl_orca_drives_it():
-    worlds, plan = batch(learners=1.0), np.random.default_rng(4).integers(0, 8, (200, 60))
+@pytest.mark.parametrize("history", [1, 2])
+def test_an_ended_robot_waits_as_it_ended_and_fl_orca_drives_it(history):
+    worlds, plan = batch(learners=1.0, history=history), np.random.default_rng(4).integers(0, 8, (200, 60))
     known = {}  # what was told of rows when they ended
     waited = 0
     for action in plan:
@@ -147,7 +148,7 @@ def test_an_ended_robot_waits_as_it_ended_and_fl_orca_drives_it():
                 np.testing.assert_array_equal(getattr(result, name)[row], known[row][name])
             assert result.reward[row] == 0
         waited += was_over.sum()
-        other = batch(learners=1.0)  # the actions of those that wait do not count
+        other = batch(learners=1.0, history=history)  # the actions of those that wait do not count
         other.set_state(state)
         other.step(np.where(was_over, 0, action))
         np.testing.assert_array_equal(other.positions(), worlds.positions())

@@ -330,6 +330,16 @@ def test_a_saved_batch_goes_on_as_the_one_that_was_not_saved(method):
             np.testing.assert_array_equal(worlds.reset(ended), restored.reset(ended))
 
 
+def test_a_mask_may_be_a_view_of_another_array():
+    whole, every_second = make(4, position_loss=0.5), np.zeros(8, np.bool_)
+    every_second[[0, 6]] = True  # of the view [::2]: worlds 0 and 3
+    strided = make(4, position_loss=0.5)
+    for worlds, mask in ((whole, every_second[::2].copy()), (strided, every_second[::2])):
+        worlds.step(np.zeros(4, np.int64))
+        worlds.reset(mask)
+    np.testing.assert_array_equal(sensed(strided), sensed(whole))
+
+
 @st.composite
 def conditions(draw):
     """Some of all conditions, at some strength."""
