@@ -28,7 +28,7 @@ from actors.service.fault_policy import Action, CallFailed, ComponentKind, decid
 from actors.service.messages import NO_OUTCOME, NO_TEAM, TEAM_DTYPE, EpisodeStats
 from actors.service.rpc import Calls, Ref, by_reference
 from sim_core.checks import require
-from sim_core.config import WorldConfig
+from sim_core.config import ONE_LEARNER, WorldConfig
 from sim_core.outcomes import Outcome
 from sim_core.pilot import Pilot
 from sim_core.worlds import WorldBatch, is_done
@@ -159,7 +159,7 @@ class _SwarmEpisodes:
     def __init__(self, config: WorldConfig, seeds: list[int]) -> None:
         self._worlds = WorldBatch(config, len(seeds))
         self._worlds.seed(seeds)
-        self._per_world = config.num_learners
+        self._per_world, self._is_team = config.num_learners, config.learners != ONE_LEARNER
         count = self.num_episodes = self._worlds.num_rows
         self._seed = np.arange(len(seeds))  # index of the seed of every world that is still stepped
         self._episode = np.arange(count)  # index of the episode of every row of these worlds
@@ -186,7 +186,7 @@ class _SwarmEpisodes:
         last.ended[episode] = done
         last.outcome[episode] = result.outcome
         last.steps[episode] = result.steps
-        if self._per_world > 1:
+        if self._is_team:
             self._watch_team()
         self._over |= self._worlds.ended_worlds()
         if self._over.mean() >= 0.5 and not self._over.all():
@@ -209,8 +209,8 @@ class _SwarmEpisodes:
         self._worlds.hit_learner[:] = hit_learner
 
     def team(self) -> NDArray[np.void]:
-        """TEAM_DTYPE `[episodes]`; empty where one robot of a world learns."""
-        if self._per_world == 1:
+        """TEAM_DTYPE `[episodes]`; empty where `learners` is one, so in all setups or in none."""
+        if not self._is_team:
             return NO_TEAM
         team = np.zeros(self.num_episodes, TEAM_DTYPE)
         team["learners"] = self._per_world

@@ -80,6 +80,15 @@ def test_several_setups_keep_the_order_of_their_seeds():
     assert at == len(stats.outcome)
 
 
+def test_a_setup_in_which_a_share_is_one_robot_is_a_team_beside_others():
+    """A quarter of a single group of two is one robot: its episodes stand beside those of worlds with several."""
+    worlds = [WorldConfig(**(SMALL | size | {"learners": 0.25})) for size in ({"robots": 2, "groups": 1}, {})]
+    spec = EnvSpec(ENV_ID, worlds[0], tuple((world, 1.0) for world in worlds))
+    assert spec.learners() == [1, 2]
+    stats = evaluate(spec, Baseline.GREEDY, SEEDS[:4])
+    assert stats.team["learners"].tolist() == [1, 2, 2, 1, 2, 2] and len(stats.outcome) == 6
+
+
 @pytest.mark.parametrize("ended", ["fl-orca", "leave"])
 def test_a_recorded_episode_is_one_robots_own(ended):
     spec = spec_of(ended_learners=ended)
