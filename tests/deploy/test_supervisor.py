@@ -1,6 +1,7 @@
 """The supervisor, with small programs in the driver's place."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from deploy.supervisor import RESUMES, Reached, reached
+from deploy.supervisor import RESUMES, Reached, reached, shoal_order
 
 PATIENCE_S = 120.0
 SUPERVISE = "import sys; from pathlib import Path; from deploy.supervisor import Supervisor\n"
@@ -167,3 +168,23 @@ def test_how_far_a_run_is(tmp_path):
     assert Reached(0, 10**9) < reached(tmp_path) == Reached(1, 200)
     (tmp_path / "metrics.jsonl").write_text("damaged\n")
     assert reached(tmp_path) == Reached(1, 0)
+
+
+def test_supervisor_and_driver_are_of_the_shoal_that_began(tmp_path):
+    """A folder `deploy` where the user stands is somebody else's, unless `python -m deploy` has taken it."""
+    other = tmp_path / "deploy"
+    other.mkdir()
+    (other / "__init__.py").write_text("raise SystemExit('somebody else')")
+    script = tmp_path / "bin" / "shoal"
+    script.parent.mkdir()
+    script.write_text("import sys\nfrom deploy.cli import main\nsys.exit(main())")
+    order = [sys.executable, str(script), "train", "--supervise", "--name", "greedy", "--engine", "process"]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    ended = subprocess.run(order, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert (ended.returncode, ended.stderr) == (2, "shoal: --name greedy is that of a baseline; choose another\n")
+
+
+@pytest.mark.parametrize(("first", "options"), [("", ["-m"]), (".", ["-m"]), ("/elsewhere", ["-P", "-m"])])
+def test_a_process_that_python_took_from_the_current_folder_goes_on_there(monkeypatch, first, options):
+    monkeypatch.setattr(sys, "path", [first, *sys.path])
+    assert shoal_order("deploy", ["train"]) == [sys.executable, *options, "deploy", "train"]
