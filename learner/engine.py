@@ -11,7 +11,6 @@ from actors.service.rpc import Calls, LocalCalls
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig
 from learner.training.cluster import Cluster, ProcessCluster
-from sim_core.checks import ConfigError
 
 
 def open_cluster(config: RunConfig, incarnation: int, options: ClusterOptions) -> Cluster:
@@ -41,11 +40,11 @@ def open_early(config: RunConfig, options: ClusterOptions, imports: str) -> Clus
 
 
 @contextmanager
-def closed_if_refused(cluster: Cluster | None) -> Iterator[None]:
-    """Closes the components if the `with` block raises a ConfigError."""
+def closed_on_error(cluster: Cluster | None) -> Iterator[None]:
+    """Closes the components if the `with` block raises anything, Ctrl-C too: a run that has not begun leaves none."""
     try:
         yield
-    except ConfigError:
+    except BaseException:
         if cluster is not None:
             cluster.close()
         raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 
 from actors.policy.baselines import Baseline
+from actors.rollout.env_guard import env_guard
 from deploy.console.terminal import plain_console
 from deploy.options.training import Launch, Train
 from deploy.runs.checks import check_device, check_environment
@@ -18,7 +19,7 @@ from deploy.runs.folders import (
 )
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig, config_hash
-from learner.engine import closed_if_refused, open_early
+from learner.engine import closed_on_error, open_early
 from learner.run_folder import RunFolder, RunIdentity
 from learner.tracking.redaction import public_uri
 from learner.training.memory_estimate import check_fits
@@ -50,19 +51,20 @@ def run(command: Train) -> int:
         check_fits(config)
     check_device(config, launch.ray_address())
     storage = new_storage(command.checkpoint_url, folder.path.name, command.keep_best)
-    opened = open_early(config, launch.cluster_options(), "deploy.training")
+    with folder.traceback_kept(), env_guard(launch.deadline_s):  # it makes an environment
+        opened = open_early(config, launch.cluster_options(), "deploy.training")
     from deploy.training import run_training  # not before, since it imports MLflow
     from learner.tracking.mlflow_run import Tracker
 
     with ExitStack() as stack:
-        with closed_if_refused(opened):
+        with closed_on_error(opened):
             tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
             stack.enter_context(folder.lock())
             _check_free(folder, not folder.has_begun())  # another process may have begun it meanwhile
             tracker.start(config)
-        folder.save_storage(storage)
-        folder.save_config(config)
-        folder.save_identity(RunIdentity(config.name, public_uri(tracker.uri), launch.experiment, tracker.run_id))
+            folder.save_storage(storage)
+            folder.save_config(config)
+            folder.save_identity(RunIdentity(config.name, public_uri(tracker.uri), launch.experiment, tracker.run_id))
         return run_training(folder, config, tracker, None, launch.cluster_options(), opened)
 
 
