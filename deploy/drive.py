@@ -7,6 +7,7 @@ slows the world and misses nothing. What a person drove is stored in the run's a
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -251,9 +252,9 @@ class DrivenRun:
 
 def _direction(x: Any, y: Any) -> NDArray[np.float32]:
     """The vector (x, y), shortened to length 1; raises ValueError unless both are finite numbers."""
-    if not all(isinstance(value, int | float) and math.isfinite(value) for value in (x, y)):
+    if not all(isinstance(value, int | float) and abs(value) <= sys.float_info.max for value in (x, y)):
         raise ValueError(f"a velocity is two numbers, not {x!r} and {y!r}")
-    return np.array([x, y], np.float32) / max(1.0, math.hypot(x, y))
+    return (np.array([x, y], np.float64) / max(1.0, math.hypot(x, y))).astype(np.float32)
 
 
 def _rounded(metres: NDArray[np.float32]) -> list[Any]:

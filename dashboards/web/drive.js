@@ -10,6 +10,7 @@ let pointer = null;      // where the pointer is held down, CSS pixels of the ca
 let number = null;       // of the scene
 let driving = false;     // a scene runs, or waits for the first key
 let paused = true;
+let moving = false;      // `drive` asks for decisions, or has not noticed a pause yet
 let paths = null;        // of the learning robot by player, metres, while a scene that has ended is shown
 let shown = null;        // the player whose episode is shown
 
@@ -77,18 +78,24 @@ function direction() {
 // Drives until the scene ends or a pause.
 async function drive() {
   paused = false;
-  while (driving && !paused) {
-    const began = performance.now(), now = step;
-    const made = await request("move.json", {step: now, ...direction()});
-    made.positions.forEach((state, i) => {
-      positions.set(state, 2 * numRobots * (now + 1 + i));
-      machine.set(made.machine[i], numRobots * (now + 1 + i));
-      if (sensed) sensed.set(made.sensed[i].map(value => value ?? NaN), 2 * numRobots * (now + 1 + i));
-    });
-    seek(now + made.positions.length);
-    if (made.outcome !== "running") return showEnd();
-    const due = made.positions.length * data.time_step_s / Number(element("speed").value);
-    await wait(Math.max(due - (performance.now() - began) / 1000, 0));
+  if (moving) return;
+  moving = true;
+  try {
+    while (driving && !paused) {
+      const began = performance.now(), now = step;
+      const made = await request("move.json", {step: now, ...direction()});
+      made.positions.forEach((state, i) => {
+        positions.set(state, 2 * numRobots * (now + 1 + i));
+        machine.set(made.machine[i], numRobots * (now + 1 + i));
+        if (sensed) sensed.set(made.sensed[i].map(value => value ?? NaN), 2 * numRobots * (now + 1 + i));
+      });
+      seek(now + made.positions.length);
+      if (made.outcome !== "running") return showEnd();
+      const due = made.positions.length * data.time_step_s / Number(element("speed").value);
+      await wait(Math.max(due - (performance.now() - began) / 1000, 0));
+    }
+  } finally {
+    moving = false;
   }
 }
 

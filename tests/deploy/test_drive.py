@@ -61,7 +61,7 @@ def drive(run: DrivenRun, number: int, x: float, y: float) -> dict[str, Any]:
 def test_a_driven_episode_is_stored_with_what_was_done(run: DrivenRun, tmp_path: Path):
     first = run.begin({"number": 2})
     assert first["steps"] == 0 and first["horizon_steps"] == WORLD.horizon_steps
-    answer = drive(run, 2, 3.0, 4.0)  # longer than 1 is as fast as it can
+    answer = drive(run, 2, 3e300, 4e300)  # longer than 1 is as fast as it can
     episode = load_driven(RunFolder(tmp_path), WORLD, SEED + 2)
     assert answer["outcome"] == OUTCOME_NAMES[Outcome(episode.outcome)] != "running"
     assert (episode.action[:-1] == BY_HAND).all()
@@ -143,7 +143,7 @@ def test_what_a_page_must_not_do_is_refused(run: DrivenRun):
         with pytest.raises(LookupError, match="scene"):
             run.begin({"number": number})
     run.begin({"number": 0})
-    for x, y in ((math.nan, 0), (0, math.inf), ("1", 0), (None, 0)):
+    for x, y in ((math.nan, 0), (0, math.inf), ("1", 0), (None, 0), (10**400, 0)):
         with pytest.raises(ValueError, match="a velocity is two numbers"):
             run.move({"step": 0, "x": x, "y": y})
     with pytest.raises(ConfigError, match="lost its scene"):
@@ -214,12 +214,16 @@ def test_chromium_keys_drive_a_scene_to_its_end(browser: Any, tmp_path: Path, we
         hold(Keys.SPACE)
         wait_until(browser, "paused")
         ActionChains(browser).key_up(Keys.ARROW_RIGHT).key_up(Keys.ARROW_UP).perform()
-        browser.execute_async_script("setTimeout(arguments[0], 300)")
+        wait_until(browser, "!moving")
         stopped = browser.execute_script("return step")
         moved = learner_at(browser) - start
         assert stopped < WORLD.horizon_steps and moved[0] > moved[1] > 0
         browser.execute_async_script("setTimeout(arguments[0], 200)")
         assert browser.execute_script("return step") == stopped  # a pause
+        browser.execute_script("element('speed').value = '0.25'")
+        hold(Keys.ARROW_LEFT, Keys.SPACE, Keys.ARROW_LEFT)  # a pause that ends before it has begun
+        wait_until(browser, f"step >= {stopped + 3}")
+        browser.execute_script("element('speed').value = '8'")
         hold(Keys.ARROW_LEFT)
         wait_until(browser, "paths !== null && shown === 'you'")
         ActionChains(browser).key_up(Keys.ARROW_LEFT).perform()
