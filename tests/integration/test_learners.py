@@ -15,6 +15,8 @@ from tests.integration.conftest import SMALL, flags, run_here
 pytestmark = pytest.mark.filterwarnings(
     "ignore:The ``noload`` loader strategy:DeprecationWarning"
 )  # MLflow's own query
+IN_PROCESS = pytest.mark.parametrize("trained", ["process"], indirect=True)
+"""For what does not depend on where the run was trained."""
 SWARM = dataclasses.replace(
     SMALL, world=dataclasses.replace(SMALL.world, learners="1.0"), envs_per_worker=12, total_env_steps=4_000
 )
@@ -52,6 +54,7 @@ def test_a_run_tells_of_the_robots_and_of_the_team(trained):
 
 
 @pytest.mark.ray
+@IN_PROCESS
 def test_a_policy_is_evaluated_at_every_other_share(trained, tmp_path):
     folder, _ = trained
     for learners, count in (("one", 1), ("1", 2), ("0.5", 4), ("1.0", 6)):
@@ -64,6 +67,7 @@ def test_a_policy_is_evaluated_at_every_other_share(trained, tmp_path):
         np.testing.assert_array_equal(stored.seed, np.repeat(stored.seed[::count], count))
 
 
+@IN_PROCESS
 def test_the_policy_is_exported_for_one_robot(trained):
     folder, _ = trained
     run_here("export", "r", "--runs-dir", f"{folder}/runs")
