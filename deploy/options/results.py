@@ -112,7 +112,7 @@ class Stress(Players):
         "position_delay_steps=0,5,10",
         "dropped_mates=0,2",
     )
-    """Axes of the grid, NAME=VALUE,VALUE,...: of `shoal train --help`, position_loss to acceleration_limit_m_s2."""
+    """Axes of the grid, NAME=VALUE,VALUE,...: senses, commands, shield, kinematics; an unknown NAME lists them all."""
     name: str | None = None
     """Name of the results' folder under RUNS_DIR/stress; made of the players' names by default."""
 

@@ -127,7 +127,11 @@ def train(checkout: Path, engine: str, **more: str) -> Training:
 
 
 def recover() -> float:
-    """Seconds from kill -9 of the driver of a supervised training over Ray to its next update."""
+    """Seconds from kill -9 of the driver of a supervised training over Ray to its next update.
+
+    Raises:
+      RuntimeError: the training ended.
+    """
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "runs" / "timed"
         order = [sys.executable, "-m", "deploy", "train", "--supervise", "--name", run.name, *ENDLESS]
@@ -135,14 +139,20 @@ def recover() -> float:
             child = subprocess.Popen(
                 [*order, "--runs-dir", str(run.parent)], env=environment(HERE), stdout=log, stderr=log
             )
+
+        def wait() -> None:
+            time.sleep(POLL_S)
+            if child.poll() is not None:
+                raise RuntimeError((Path(folder) / "log").read_text())
+
         try:
             while not list((run / CHECKPOINTS).glob("step-*[0-9]")):
-                time.sleep(POLL_S)
+                wait()
             (driver,) = psutil.Process(child.pid).children()
             driver.kill()
             killed_s, updated_s = time.time(), list[float]()
             while not updated_s:
-                time.sleep(POLL_S)
+                wait()
                 rows = [row for row in read_rows(run / JOURNAL) if "train/loss" in row.metrics]
                 updated_s = [row.time_ms / 1e3 for row in rows if row.time_ms / 1e3 > killed_s]
             return updated_s[0] - killed_s
