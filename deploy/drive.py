@@ -99,10 +99,15 @@ def total(player: str, results: list[Result]) -> Total:
     )
 
 
+def driven_world(world: WorldConfig) -> WorldConfig:
+    """The world with one learning robot, which a person drives, whatever learned in it."""
+    return replace(world, learners=ONE_LEARNER)
+
+
 def driven_store(folder: RunFolder, world: WorldConfig, seed: int) -> Path:
     """Where the episode that a person drove on a scene of this world is stored."""
-    alone = replace(world, learners=ONE_LEARNER)
-    return folder.artifacts / "driven" / config_hash(RunConfig(world=alone)) / f"episode-{seed}.zarr"
+    place = config_hash(RunConfig(world=driven_world(world)))
+    return folder.artifacts / "driven" / place / f"episode-{seed}.zarr"
 
 
 def load_driven(folder: RunFolder, world: WorldConfig, seed: int) -> Episode:
@@ -131,7 +136,7 @@ class DrivenRun:
 
     def __init__(self, folder: RunFolder, world: WorldConfig, weights: WeightsSnapshot, first_seed: int) -> None:
         self._folder = folder
-        self._world = world = replace(world, learners=ONE_LEARNER)  # a person drives one robot, all others FL-ORCA
+        self._world = world = driven_world(world)
         self._spec = EnvSpec(ENV_ID, world)
         self._first_seed = first_seed
         rules = [rule for rule in (*METHOD_RULES, Baseline.FL_ORCA) if exists(rule, world)]

@@ -25,7 +25,7 @@ a smaller rate, and
 - M_IN and M_OUT have a rule of theirs as a teacher (`field`, `greedy`), and learn from turned transitions.
 
 `generalist` is `best` for one policy that learns all setups of the dissertation at once. M_sensor's looks further ahead
-(a discount of 0.985 a decision): with 0.97 it comes late in large swarms, where only the clock is left to lose to.
+(a discount of 0.985 a decision): with 0.97 it comes too late in large swarms, where only timeouts are left.
 
 What a preset sets for one method alone stands with the method (`Method.presets`).
 """

@@ -14,16 +14,16 @@ from dashboards.figures.film_strip import episode_strip_png
 from dashboards.figures.video import check_video_packages
 from deploy.console.serving import serve_until_interrupted
 from deploy.console.terminal import plain_console
-from deploy.drive import drive_server, load_driven
+from deploy.drive import drive_server, driven_world, load_driven
 from deploy.live import live_server
 from deploy.options.results import Watch
 from deploy.runs.artifacts import foreign_animation, write_player, write_video
 from deploy.runs.folders import make_folder
 from deploy.runs.policy_lookup import find_policy
 from learner.cluster_options import DEADLINE_S
-from learner.config import RunConfig
 from learner.run_folder import find_run
 from sim_core.checks import require
+from sim_core.config import WorldConfig
 from sim_core.outcomes import OUTCOME_NAMES
 
 
@@ -50,9 +50,9 @@ def run(command: Watch) -> int:
     path = command.out or folder.artifacts / f"{played}-{command.seed}.{command.format}"
     make_folder(path.parent, "--out" if command.out else "without --out, the run's folder")
     if command.drive:
-        _render_swarm(config, load_driven(folder, config.world, command.seed), command, path)
+        _render_swarm(driven_world(config.world), load_driven(folder, config.world, command.seed), command, path)
     elif config.env.is_swarm:
-        _render_swarm(config, record_episode(config.env, weights, command.seed), command, path)
+        _render_swarm(config.world, record_episode(config.env, weights, command.seed), command, path)
     else:
         require(command.format == "mp4", f"{config.env_id} can only be watched as a video; use --format mp4")
         with env_guard(DEADLINE_S):
@@ -61,15 +61,15 @@ def run(command: Watch) -> int:
     return 0
 
 
-def _render_swarm(config: RunConfig, episode: Episode, command: Watch, path: Path) -> None:
+def _render_swarm(world: WorldConfig, episode: Episode, command: Watch, path: Path) -> None:
     """Writes the episode to `path`; in the run's artifacts it is kept as zarr, too."""
     with tempfile.TemporaryDirectory(prefix="shoal-") as folder:
         store = Path(folder) / "episode.zarr" if command.out else path.with_suffix(".zarr")
-        save_episodes(store, [episode], config.world)
+        save_episodes(store, [episode], world)
         if command.format == "html":
-            write_player(store, path, f"{config.world.method_name} {config.world.setup}")
+            write_player(store, path, f"{world.method_name} {world.setup}")
         elif command.format == "mp4":
             write_video(store, path)
         else:
-            episode_strip_png(episode, config.world, path)
+            episode_strip_png(episode, world, path)
     plain_console().print(f"{len(episode.action) - 1} env steps, outcome {OUTCOME_NAMES[episode.outcome]}")
