@@ -102,8 +102,19 @@ def ratio(samples: Sequence[Sequence[tuple[int, int]]]) -> Estimate:
     return Estimate(binomial.value, low, high)
 
 
+def success_rate(successes: np.ndarray) -> Estimate:
+    """Share of the successes `[worlds, learners]` bool, with the interval of worlds: robots of one share their fate."""
+    worlds, learners = successes.shape
+    pairs = [(int(count), learners) for count in successes.sum(axis=1)]
+    return rate(int(successes.sum()), worlds * learners, dispersion([pairs]) if learners > 1 else 1.0)
+
+
 class PairedComparison(NamedTuple):
-    """Two players on the same start scenes: the difference of their success rates, and the sign test's p-value."""
+    """Two players on the same start scenes: the difference of their success rates, and the sign test's p-value.
+
+    `won` and `lost` count the worlds in which one of the two alone had success; where several robots of a world learn,
+    had more.
+    """
 
     difference: Estimate
     won: int
@@ -112,23 +123,37 @@ class PairedComparison(NamedTuple):
 
 
 def paired_comparison(first: np.ndarray, second: np.ndarray) -> PairedComparison:
-    """Compares the successes `[count]` bool of two players in the same episodes.
+    """Compares the successes `[worlds]` or `[worlds, learners]` bool of two players in the same worlds.
 
     The interval of the difference of the rates, second less first, is that of Bonett and Price (2012, "Adjusted Wald
-    confidence interval for a difference of binomial proportions based on paired data"). The sign test is the exact
-    binomial test of the episodes that one of the two alone won (McNemar 1947).
+    confidence interval for a difference of binomial proportions based on paired data"); where several robots of a world
+    learn, also Student's t interval over the worlds, if that reaches further. The sign test is the exact binomial test
+    of the worlds that one of the two won (McNemar 1947).
 
     Raises:
-      ValueError: the numbers of episodes differ, or there are none.
+      ValueError: the numbers of worlds or robots differ, or there are none.
     """
-    if len(first) != len(second) or len(first) == 0:
-        raise ValueError(f"paired results need equally many episodes, not {len(first)} and {len(second)}")
-    total, won, lost = len(first), int((second & ~first).sum()), int((first & ~second).sum())
+    if first.shape != second.shape or first.size == 0:
+        raise ValueError(f"paired results need equally many episodes, not {first.shape} and {second.shape}")
+    first, second = first.reshape(len(first), -1), second.reshape(len(second), -1)
+    learners = first.shape[1]
+    estimate = _difference(first.size, int((second & ~first).sum()), int((first & ~second).sum()))
+    more = second.sum(axis=1) - first.sum(axis=1)
+    if learners > 1:
+        of_worlds = mean(more / learners)
+        estimate = estimate._replace(
+            low=max(-1.0, min(estimate.low, of_worlds.low)), high=min(1.0, max(estimate.high, of_worlds.high))
+        )
+    won, lost = int((more > 0).sum()), int((more < 0).sum())
+    p_value = min(1.0, 2 * float(special.bdtr(min(won, lost), won + lost, 0.5))) if won + lost else 1.0
+    return PairedComparison(estimate, won, lost, p_value)
+
+
+def _difference(total: int, won: int, lost: int) -> Estimate:
+    """The difference of two rates of `total` pairs, of which one player alone won `won`, the other `lost`."""
     up, down = (won + 1) / (total + 2), (lost + 1) / (total + 2)
     half = Z * math.sqrt((up + down - (up - down) ** 2) / (total + 2))
-    low, high = max(-1.0, up - down - half), min(1.0, up - down + half)
-    p_value = min(1.0, 2 * float(special.bdtr(min(won, lost), won + lost, 0.5))) if won + lost else 1.0
-    return PairedComparison(Estimate((won - lost) / total, low, high), won, lost, p_value)
+    return Estimate((won - lost) / total, max(-1.0, up - down - half), min(1.0, up - down + half))
 
 
 def mean(values: np.ndarray) -> Estimate:

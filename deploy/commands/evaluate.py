@@ -83,7 +83,7 @@ def _compare(command: Evaluate, targets: list[Target]) -> int:
     for i, world in enumerate(first.spec.worlds):
         goals = list[NDArray[np.bool_]]()
         for target, stats in zip(targets, played, strict=True):
-            goals.append(stats[i].outcome == int(Outcome.GOAL))
+            goals.append(np.equal(stats[i].outcome, int(Outcome.GOAL)).reshape(len(seeds), -1))
             table.add_row(*compared(world.setup if target is first else "", target.name, goals))
         table.add_section()
     plain_console().print(table)

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.table import Table
 
 from actors.evaluation.conditions import Axis, Condition, along, breaking_point, grid, parse_axis
-from actors.evaluation.statistics import as_percent, paired_comparison, rate
+from actors.evaluation.statistics import as_percent, paired_comparison, success_rate
 from dashboards.figures.stress_curves import stress_curves_png
 from deploy.console.summary_tables import signed_percent
 from deploy.console.terminal import plain_console
@@ -102,7 +102,7 @@ def _table(results: StressResults, targets: Sequence[Target], conditions: Sequen
                 to_first = paired_comparison(results.goals(0, setup, number), goals).difference if player else None
                 to_clean = paired_comparison(results.goals(player, setup, 0), goals).difference if number else None
                 where = ("", *("" for _ in condition)) if player else (name, *map(str, condition.values()))
-                share = as_percent(rate(int(goals.sum()), len(goals)))
+                share = as_percent(success_rate(goals))
                 table.add_row(*where, target.name, share, signed_percent(to_first), signed_percent(to_clean))
             table.add_section()
     return table

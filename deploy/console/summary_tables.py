@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from actors.evaluation.statistics import Estimate, paired_comparison, rate
+from actors.evaluation.statistics import Estimate, paired_comparison, success_rate
 from learner.run import RunResult
 from learner.run_folder import RunFolder
 from learner.training.evaluation_summary import Evaluation, outcome_label
@@ -56,12 +56,12 @@ def compared(setup: str, name: str, goals: list[NDArray[np.bool_]]) -> tuple[str
     Args:
       setup: name of the setup.
       name: the player's.
-      goals: successes `[episodes]` of the players so far, the first one's first and this one's last.
+      goals: successes `[worlds, learners]` of the players so far, the first one's first and this one's last.
 
     Returns:
       Setup, name, success rate with interval; difference to the first with interval, and the sign test.
     """
-    played = (setup, name, *percent(rate(int(goals[-1].sum()), len(goals[-1]))))
+    played = (setup, name, *percent(success_rate(goals[-1])))
     if len(goals) == 1:
         return (*played, "", "", "")
     paired = paired_comparison(goals[0], goals[-1])

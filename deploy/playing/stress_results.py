@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from actors.evaluation.conditions import Axis, Condition, along, world_under
 from actors.evaluation.evaluation_store import StoredEvaluation, entry_seeds, load_evaluation, save_evaluation
-from actors.evaluation.statistics import Estimate, rate
+from actors.evaluation.statistics import Estimate, success_rate
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.env_spec import EnvSpec
 from actors.service.messages import EpisodeStats
@@ -114,8 +114,9 @@ class StressResults:
             raise ConfigError(f"{error}; remove {path} and give the same command again") from error
 
     def goals(self, player: int, setup: int, condition: int) -> NDArray[np.bool_]:
-        """Successes `[episodes]` of a cell."""
-        return np.equal(self.stats(player, setup, condition).outcome, int(Outcome.GOAL))
+        """Successes `[worlds, learners]` of a cell."""
+        outcome = self.stats(player, setup, condition).outcome
+        return np.equal(outcome, int(Outcome.GOAL)).reshape(len(self._seeds), -1)
 
     def setups(self) -> list[str]:
         """The setups' names."""
@@ -149,7 +150,7 @@ class StressResults:
     def _curves(self, axis: Axis, setup: int) -> dict[str, list[Estimate]]:
         conditions = [list(self._conditions).index(condition) for condition in along(axis, self._axes)]
         return {
-            target.name: [_rate(self.goals(player, setup, condition)) for condition in conditions]
+            target.name: [success_rate(self.goals(player, setup, condition)) for condition in conditions]
             for player, target in enumerate(self._targets)
         }
 
@@ -157,7 +158,3 @@ class StressResults:
 def _identity(world: WorldConfig) -> str:
     """All that decides a world's episodes, in a form that does not depend on where a user's files lie."""
     return json.dumps(identity_dict(RunConfig(world=world))["world"], sort_keys=True)
-
-
-def _rate(goals: NDArray[np.bool_]) -> Estimate:
-    return rate(int(goals.sum()), len(goals))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from actors.evaluation.statistics import dispersion, mean, paired_comparison, rate, ratio
+from actors.evaluation.statistics import dispersion, mean, paired_comparison, rate, ratio, success_rate
 
 
 def wilson(count, total):
@@ -128,3 +128,29 @@ def test_the_paired_interval_has_its_coverage_and_is_narrower_than_an_unpaired_o
         narrower += found.difference.high - found.difference.low < unpaired
     assert 0.94 <= hits / 2_000 <= 0.97
     assert narrower == 2_000
+
+
+def fates(rng, shares, learners):
+    """Successes `[worlds, learners]` of worlds whose robots have one chance, which is 0 or 1 for half of them."""
+    chance = rng.choice([0.0, 1.0, *shares], p=[0.25, 0.25, *(0.5 / len(shares) for _ in shares)], size=200)
+    return rng.random((200, learners)) < chance[:, None]
+
+
+def test_robots_of_one_world_are_no_independent_trials():
+    rng = np.random.default_rng(5)
+    covered, differs, significant, naive = 0, 0, 0, 0
+    for _ in range(400):
+        first, second = fates(rng, [0.5], 10), fates(rng, [0.5], 10)
+        alone, found = success_rate(first), paired_comparison(first, second)
+        covered += alone.low <= 0.5 <= alone.high
+        differs += not found.difference.low <= 0 <= found.difference.high
+        significant += found.p_value < 0.05
+        naive += paired_comparison(first.ravel(), second.ravel()).p_value < 0.05
+        assert found.difference.value == pytest.approx(second.mean() - first.mean())
+    assert 0.92 < covered / 400 < 0.98 and differs / 400 < 0.08 and significant / 400 < 0.08 and naive / 400 > 0.3
+
+
+def test_one_robot_a_world_is_an_episode():
+    first, second = flags(36, 3, 12, 49)
+    assert success_rate(first[:, None]) == rate(48, 100)
+    assert paired_comparison(first[:, None], second[:, None]) == paired_comparison(first, second)
