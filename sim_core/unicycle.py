@@ -37,21 +37,21 @@ def unicycle_params(config: WorldConfig) -> UnicycleParams:
 
 @kernel
 def _begin(state, mask, facing, speed):
-    for world in range(mask.shape[0]):
-        if mask[world]:
-            dx, dy = goal_offset(state, world)
+    for row in range(mask.shape[0]):
+        if mask[row]:
+            dx, dy = goal_offset(state, row)
             length = max(math.sqrt(float(dx) * dx + float(dy) * dy), 1e-30)
-            facing[world, 0], facing[world, 1], speed[world] = dx / length, dy / length, 0.0
+            facing[row, 0], facing[row, 1], speed[row] = dx / length, dy / length, 0.0
 
 
 @kernel
 def _drive(mask, command_x, command_y, facing, speed, params):
     p = params[0]
-    for world in range(mask.shape[0]):
-        if not mask[world]:
+    for row in range(mask.shape[0]):
+        if not mask[row]:
             continue
-        x, y = float(command_x[world]), float(command_y[world])
-        ahead_x, ahead_y = facing[world, 0], facing[world, 1]
+        x, y = float(command_x[row]), float(command_y[row])
+        ahead_x, ahead_y = facing[row, 0], facing[row, 1]
         asked, along = math.sqrt(x * x + y * y), 0.0
         if asked > 0.0:
             if ahead_x * x + ahead_y * y >= p.cos_turn * asked:
@@ -60,9 +60,9 @@ def _drive(mask, command_x, command_y, facing, speed, params):
                 sin = p.sin_turn if ahead_x * y - ahead_y * x >= 0.0 else -p.sin_turn
                 ahead_x, ahead_y = p.cos_turn * ahead_x - sin * ahead_y, sin * ahead_x + p.cos_turn * ahead_y
             along = max(ahead_x * x + ahead_y * y, 0.0)
-        change = min(max(along - speed[world], -p.speed_change), p.speed_change)
-        facing[world, 0], facing[world, 1], speed[world] = ahead_x, ahead_y, speed[world] + change
-        command_x[world], command_y[world] = speed[world] * ahead_x, speed[world] * ahead_y
+        change = min(max(along - speed[row], -p.speed_change), p.speed_change)
+        facing[row, 0], facing[row, 1], speed[row] = ahead_x, ahead_y, speed[row] + change
+        command_x[row], command_y[row] = speed[row] * ahead_x, speed[row] * ahead_y
 
 
 class Unicycle:
@@ -70,22 +70,22 @@ class Unicycle:
 
     Args:
       config: the world.
-      num_worlds: size of the batch.
+      num_rows: learning robots of the batch.
     """
 
-    def __init__(self, config: WorldConfig, num_worlds: int) -> None:
+    def __init__(self, config: WorldConfig, num_rows: int) -> None:
         self._params = packed(unicycle_params(config))
-        self._facing = np.zeros((num_worlds, 2))
-        self._speed = np.zeros(num_worlds)
+        self._facing = np.zeros((num_rows, 2))
+        self._speed = np.zeros(num_rows)
 
     def begin(self, state: WorldState, mask: NDArray[np.bool_]) -> None:
-        """Begins the episodes that have just been set up where `mask` `[num_worlds]` is set."""
+        """Begins the episodes that have just been set up where `mask` `[num_rows]` is set."""
         _begin(state, mask, self._facing, self._speed)
 
     def drive(self, mask: NDArray[np.bool_], command_x: NDArray[np.float32], command_y: NDArray[np.float32]) -> None:
-        """Changes velocities `[num_worlds]` (m/s) that are asked for to those driven, where `mask` is set."""
+        """Changes velocities `[num_rows]` (m/s) that are asked for to those driven, where `mask` is set."""
         _drive(mask, command_x, command_y, self._facing, self._speed, self._params)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays that steps change, by name: headings (unit vectors) `[num_worlds, 2]`, speeds `[num_worlds]`."""
+        """The arrays that steps change, by name: headings (unit vectors) `[num_rows, 2]`, speeds (m/s) `[num_rows]`."""
         return {"unicycle_facing": self._facing, "unicycle_speed": self._speed}

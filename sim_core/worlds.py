@@ -99,7 +99,7 @@ class WorldBatch:
         self._scene_state = self.state._replace(learner=scene_learner)
         impaired, shielded = config.senses_badly or config.drives_badly, config.shield == "orca"
         is_unicycle = config.kinematics == "unicycle"
-        wants_rows = self._several and (impaired or shielded or is_unicycle or bool(config.source(METHODS)))
+        wants_rows = self._several and (impaired or shielded or bool(config.source(METHODS)))
         self._view = RowView(self.state) if wants_rows else None
         self._known: WorldState = self.state if self._view is None else self._view.state
         self._senses = Senses(config, self._known) if impaired else None
@@ -138,7 +138,7 @@ class WorldBatch:
         """Starts new episodes where `mask` `[num_worlds]` is set (everywhere by default).
 
         Returns:
-          Observations of all worlds, a copy.
+          Observations of all rows, a copy.
         """
         mask = self._all if mask is None else np.ascontiguousarray(mask)  # as kernels of `for_types_of` read it
         rows = self.rows_of(mask)
