@@ -26,12 +26,12 @@ class PolicyNode(Node):
 
     def __init__(self) -> None:
         super().__init__("shoal_policy")
-        self.goals = np.reshape(self.declare_parameter("goals", [0.0, 0.0]).value, (-1, 2))  # x, y, own group's first
+        goals = self.declare_parameter("goals", [0.0, 0.0]).value  # x, y of each group's goal, own group's first
         self.stale_ns = 1e9 * self.declare_parameter("stale_s", 0.5).value
         self.policy, self.about = loop["load"](Path(self.declare_parameter("export", "export").value))
-        if self.about["shield"]["used"] or self.about["settings"]["world"]["groups"] != len(self.goals):
+        if self.about["shield"]["used"] or self.about["settings"]["world"]["groups"] * 2 != len(goals):
             raise SystemExit("name a goal (x, y) of each group; a policy with a shield needs velocities, too: not here")
-        self.tick, self.action = 0, -1
+        self.goals, self.tick, self.action = np.reshape(goals, (-1, 2)), 0, -1
         self.heard: dict[str, tuple[int, Any]] = {}  # topic: when it was heard (ns), and its newest message
         for topic in ("pose", *(f"group_{group}" for group in range(len(self.goals)))):
             kind = PoseStamped if topic == "pose" else PoseArray

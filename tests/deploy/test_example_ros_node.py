@@ -207,9 +207,10 @@ def test_robots_that_are_not_sensed_are_left_out(monkeypatch: pytest.MonkeyPatch
     assert driven(ros.published[-1], 0.0).tolist() == [0.0, 0.0]
 
 
-def test_it_refuses_what_it_cannot_drive(monkeypatch: pytest.MonkeyPatch, played: Played, tmp_path: Path):
-    with pytest.raises(SystemExit, match="name a goal"):
-        start(monkeypatch, played, goals=[1.0, 2.0])
+def test_it_refuses_what_it_cannot_drive(monkeypatch: pytest.MonkeyPatch, played: Played):
+    for goals in ([1.0, 2.0], [1.0] * (2 * played.world.groups + 1)):
+        with pytest.raises(SystemExit, match="name a goal"):
+            start(monkeypatch, played, goals=goals)
 
 
 def test_a_unicycle_gets_speed_and_turn_rate(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory):
