@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 from typing import Any, TypeVar, TypeVarTuple
 
 import psutil
@@ -39,6 +40,7 @@ from learner.training.cluster import (
     rollout_settings,
     shard_settings,
 )
+from learner.training.stop_signals import Interrupted
 from learner.update.learner_node import LearnerNode
 from sim_core.checks import ConfigError, require
 
@@ -177,13 +179,20 @@ def _kept_from_children(number: int) -> Iterator[None]:
 
 @contextmanager
 def _own_handler(number: int) -> Iterator[None]:
-    """Restores the handler of a signal after the `with` block: Ray sets one that ends the process with other codes."""
+    """Restores the handler of a signal after the `with` block: Ray sets one that ends the process with other codes.
+
+    Where the signal would end this process at once, it raises Interrupted from then on, so that what is open is closed.
+    """
     before = signal.getsignal(number)
     try:
         yield
     finally:
         if threading.current_thread() is threading.main_thread():
-            signal.signal(number, before)
+            signal.signal(number, _interrupt if before in (signal.SIG_DFL, None) else before)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise Interrupted(number)
 
 
 def leave() -> None:
