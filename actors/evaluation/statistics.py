@@ -102,11 +102,23 @@ def ratio(samples: Sequence[Sequence[tuple[int, int]]]) -> Estimate:
     return Estimate(binomial.value, low, high)
 
 
+def rate_of_worlds(pairs: Sequence[tuple[int, int]]) -> Estimate:
+    """Success rate of robots that share the fate of their worlds, with the interval of worlds.
+
+    Args:
+      pairs: (successes, robots) of every world. Where all robots succeed, or none, nothing tells how much those of one
+        world have in common; a world then counts as one trial.
+    """
+    count, total = (sum(pair[i] for pair in pairs) for i in (0, 1))
+    if total == len(pairs):
+        return rate(count, total)
+    knows = len(pairs) > 1 and 0 < count < total
+    return rate(count, total, dispersion([pairs]) if knows else total / len(pairs))
+
+
 def success_rate(successes: np.ndarray) -> Estimate:
-    """Share of the successes `[worlds, learners]` bool, with the interval of worlds: robots of one share their fate."""
-    worlds, learners = successes.shape
-    pairs = [(int(count), learners) for count in successes.sum(axis=1)]
-    return rate(int(successes.sum()), worlds * learners, dispersion([pairs]) if learners > 1 else 1.0)
+    """Share of the successes `[worlds, learners]` bool (see `rate_of_worlds`)."""
+    return rate_of_worlds([(int(count), successes.shape[1]) for count in successes.sum(axis=1)])
 
 
 class PairedComparison(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.evaluation.statistics import Estimate, dispersion, mean, rate
+from actors.evaluation.statistics import Estimate, mean, rate, rate_of_worlds
 from actors.service.messages import NO_OUTCOME, EpisodeStats
 from sim_core.outcomes import ENDED, Outcome
 
@@ -66,14 +66,13 @@ def _summarise_worlds(stats: EpisodeStats) -> Evaluation:
     begins = [0]
     while begins[-1] + learners[begins[-1]] < len(learners):
         begins.append(begins[-1] + int(learners[begins[-1]]))
-    sizes, total = learners[begins], len(learners)
+    sizes = learners[begins]
 
     def by_world(values: NDArray[Any]) -> NDArray[np.float64]:
         return np.add.reduceat(values.astype(np.float64), begins)
 
     def share(happened: NDArray[np.bool_]) -> Estimate:
-        pairs = list(zip(by_world(happened).astype(int).tolist(), sizes.tolist(), strict=True))
-        return rate(int(happened.sum()), total, dispersion([pairs]))
+        return rate_of_worlds(list(zip(by_world(happened).astype(int).tolist(), sizes.tolist(), strict=True)))
 
     arrived = stats.outcome == int(Outcome.GOAL)
     everyone = by_world(arrived) == sizes
@@ -86,7 +85,7 @@ def _summarise_worlds(stats: EpisodeStats) -> Evaluation:
         learner_collisions=share(stats.team["hit_learner"]),
     )
     return Evaluation(
-        episodes=total,
+        episodes=len(learners),
         rates={kind: share(stats.outcome == kind) for kind in ENDED},
         episode_return=mean(by_world(stats.episode_return) / sizes),
         episode_length=mean(by_world(stats.length_steps) / sizes),

@@ -150,6 +150,12 @@ def test_robots_of_one_world_are_no_independent_trials():
     assert 0.92 < covered / 400 < 0.98 and differs / 400 < 0.08 and significant / 400 < 0.08 and naive / 400 > 0.3
 
 
+@pytest.mark.parametrize("all_succeed", [True, False])
+def test_worlds_are_trials_where_all_robots_have_one_fate(all_succeed):
+    found, worlds = success_rate(np.full((12, 10), all_succeed)), rate(12 * all_succeed, 12)
+    assert found == pytest.approx(worlds)
+
+
 def test_one_robot_a_world_is_an_episode():
     first, second = flags(36, 3, 12, 49)
     assert success_rate(first[:, None]) == rate(48, 100)
