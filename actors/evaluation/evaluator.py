@@ -86,7 +86,8 @@ def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> EpisodeSt
     """
     if spec.shares:
         return _evaluate_in_turn(spec, candidate, np.array(seeds, np.int64))
-    chunks = [seeds[i : i + MAX_ENVS] for i in range(0, len(seeds), MAX_ENVS)]
+    most = max(1, MAX_ENVS // (spec.world.num_learners if spec.is_swarm else 1))
+    chunks = [seeds[i : i + most] for i in range(0, len(seeds), most)]
     return join_stats([_play(spec, make_action_rule(spec, candidate, chunk), chunk) for chunk in chunks])
 
 

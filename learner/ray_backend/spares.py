@@ -6,6 +6,7 @@ and has rehearsed the work of its kind. It holds no part of the run until `begin
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeVar
 
@@ -19,6 +20,9 @@ from actors.rollout.worker import RolloutSettings, RolloutWorker
 from actors.service.rpc import Calls, Handle
 
 N = TypeVar("N")
+
+MOST_FAILURES = 3
+"""Spares that may fail to start, one after the other, before no more are started."""
 
 
 class Spare:
@@ -84,13 +88,24 @@ class Spares(Generic[N]):
         self._count = count
         self._start = start
         self._waiting: list[tuple[Any, Any]] = []
+        self._failures = 0
 
     def keep(self) -> None:
-        """Starts what is missing; where the cluster has no free CPU slot, Ray starts it once there is one."""
+        """Starts what is missing; where the cluster has no free CPU slot, Ray starts it once there is one.
+
+        After `MOST_FAILURES` that could not start, one after the other, it says so and starts no more.
+        """
         for pair in self._ready():
-            if not _is_alive(pair[1]):
+            if _is_alive(pair[1]):
+                self._failures = 0
+            else:
                 self._waiting.remove(pair)
-        while len(self._waiting) < self._count:
+                self._failures += 1
+                if self._failures == MOST_FAILURES:
+                    logging.getLogger(__name__).warning(
+                        "%d spares could not start, one after the other; the run goes on without", MOST_FAILURES
+                    )
+        while len(self._waiting) < self._count and self._failures < MOST_FAILURES:
             spare: Any = self._start()
             self._waiting.append((spare, spare.is_ready.remote()))
 

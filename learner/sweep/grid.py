@@ -88,9 +88,9 @@ class SweepConfig:
 
 SET_BY_GRID = (
     "world seed engine device method sources robots groups env_id total_env_steps "
-    "final_eval_episodes final_eval_first_seed"
+    "final_eval_episodes final_eval_first_seed learners"
 ).split()
-"""Settings that the grid sets itself: no override may name them."""
+"""Settings that no override may name: the grid sets them itself, and its tables count worlds of one learning robot."""
 
 
 def parse_overrides(assignments: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -78,11 +78,11 @@ def wait_until(condition):
 
 
 @pytest.mark.ray
-def test_a_spare_that_could_not_start_is_replaced():
+def test_a_spare_that_could_not_start_is_replaced_a_few_times(caplog):
     import ray
 
     from learner.ray_backend.cluster import connect, leave
-    from learner.ray_backend.spares import Spare, Spares
+    from learner.ray_backend.spares import MOST_FAILURES, Spare, Spares
 
     class Fails(Spare):
         def __init__(self):
@@ -104,6 +104,17 @@ def test_a_spare_that_could_not_start_is_replaced():
         assert ray.get(ready, timeout=PATIENCE_S) and not kinds
         assert spares.take() is spare
         assert spares.take() is None
+
+        started = []
+        spares = Spares(1, lambda: started.append(ray.remote(num_cpus=0)(Fails).remote()) or started[-1])
+        for _ in range(MOST_FAILURES):
+            assert "could not start" not in caplog.text
+            spares.keep()
+            ray.wait([ready for _, ready in spares._waiting], timeout=PATIENCE_S)
+        for _ in range(2):
+            spares.keep()
+        assert len(started) == MOST_FAILURES and not spares._waiting
+        assert caplog.text.count("spares could not start") == 1
     finally:
         leave()
 

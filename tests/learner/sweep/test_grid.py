@@ -164,6 +164,7 @@ def test_settings_override_the_presets():
         ("=3", "NAME=VALUE"),
         ("n_stp=3", "cannot change 'n_stp'"),
         ("robots=7", "cannot change 'robots'"),
+        ("learners=0.5", "cannot change 'learners'"),
         ("seed=7", "cannot change 'seed'"),
         pytest.param(f"hidden_sizes={'[' * 100_000}", "hidden_sizes is nested too deeply", id="nested"),
         ("final_eval_first_seed=7", "cannot change 'final_eval_first_seed'"),
