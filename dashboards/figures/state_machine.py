@@ -5,6 +5,7 @@ The states and their conditions are those of `sim_core.swarm.flocking`; shares a
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -33,8 +34,8 @@ SHORTEN = 0.3
 
 
 def recorded_states(world: WorldConfig, seed: int) -> NDArray[np.int8]:
-    """The states `[steps, robots]` int8 of all robots in one episode that FL-ORCA drives."""
-    worlds = WorldBatch(world, 1)
+    """The states `[simulator steps, robots]` int8 of all robots in one episode that FL-ORCA drives."""
+    worlds = WorldBatch(dataclasses.replace(world, decision_interval_steps=1), 1)
     worlds.seed([seed])
     worlds.reset()
     rows, outcome = [], int(Outcome.RUNNING)

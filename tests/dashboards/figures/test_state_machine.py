@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -24,6 +26,11 @@ def test_changes_are_those_of_a_count_by_hand(states: np.ndarray):
             pairs = [(a, b) for a, b in zip(states, states[1:], strict=False)]
             assert counts[before, after] == sum(int(((a == before) & (b == after)).sum()) for a, b in pairs)
     assert counts.sum() == (len(states) - 1) * WORLD.num_robots
+
+
+def test_every_simulator_step_counts_however_long_a_decision_lasts(states: np.ndarray):
+    slow = recorded_states(dataclasses.replace(WORLD, decision_interval_steps=4), 3)
+    np.testing.assert_array_equal(slow, states)
 
 
 def test_in_a_world_of_one_group_nobody_senses_another(states: np.ndarray):
