@@ -70,6 +70,9 @@ def test_every_gauge_is_on_the_dashboard_or_left_out_on_purpose():
     failures = ("lost", "captured", "collision", "timeout")
     left_out = {f"ray_shoal_eval_{name}_rate_{end}" for name in failures for end in ("low", "high")}
     left_out |= {"ray_shoal_eval_return_low", "ray_shoal_eval_return_high"}
+    shares = ("all_arrive_rate", "learner_collision_rate")  # of teams: only where several robots of a world learn
+    left_out |= {f"ray_shoal_eval_{name}{end}" for name in shares for end in ("", "_low", "_high")}
+    left_out |= {"ray_shoal_eval_last_arrival_steps", "ray_shoal_eval_segregation"}
     assert OURS - shown == left_out
 
 

@@ -55,9 +55,9 @@ def test_a_run_tells_of_the_robots_and_of_the_team(trained):
 
 @pytest.mark.ray
 @IN_PROCESS
-def test_a_policy_is_evaluated_at_every_other_share(trained, tmp_path):
+def test_a_policy_is_evaluated_at_another_share(trained, tmp_path):
     folder, _ = trained
-    for learners, count in (("one", 1), ("1", 2), ("0.5", 4), ("1.0", 6)):
+    for learners, count in (("one", 1), ("0.5", 4)):
         out = tmp_path / f"{learners}.zarr"
         played = ["--learners", learners, "--episodes", "5", "--out", str(out)]
         run_here("evaluate", "r", "--runs-dir", f"{folder}/runs", *played)

@@ -6,7 +6,6 @@ import psutil
 import pytest
 
 from deploy.chaos.invariants import broken_invariants
-from deploy.supervisor import Reached, reached
 from learner.run_folder import RunFolder
 from learner.tracking.fault_log import read_faults
 from tests.integration.conftest import PATIENCE_S, SMALL, flags
@@ -31,27 +30,18 @@ LONG = dataclasses.replace(
 
 def test_a_run_whose_driver_is_killed_ends_with_all_accounts(tmp_path):
     job, folder = Job(tmp_path, "train", "--supervise", "--name", "r", *flags(LONG)), RunFolder(tmp_path / "runs" / "r")
-
-    def resumed():
-        return sum(entry.event == "resumed" for entry in read_faults(folder.faults))
-
-    before = Reached(0, 0)
     try:
-        for times in range(2):
-            job.wait_for(lambda times=times: resumed() == times)
-            job.wait_for_checkpoints("r", 1)
-            job.wait_for(lambda before=before: reached(folder.path) > before)  # else the next death ends it
-            before = reached(folder.path)
-            (driver,) = psutil.Process(job.process.pid).children()
-            others = driver.children(recursive=True)
-            assert len(others) > 3, "Ray runs in processes of its own"
-            driver.kill()
-            job.wait_for(lambda times=times: job.log.read_text().count("going on with the run") == times + 1)
-            assert not any(process.is_running() for process in others), "nothing of it may write any more"
+        job.wait_for_checkpoints("r", 1)
+        (driver,) = psutil.Process(job.process.pid).children()
+        others = driver.children(recursive=True)
+        assert len(others) > 3, "Ray runs in processes of its own"
+        driver.kill()
+        job.wait_for(lambda: "going on with the run" in job.log.read_text())
+        assert not any(process.is_running() for process in others), "nothing of it may write any more"
         assert job.process.wait(PATIENCE_S) == 0, job.log.read_text()
     finally:
         if job.process.poll() is None:
             job.kill_all()
-    assert resumed() == 2
+    assert sum(entry.event == "resumed" for entry in read_faults(folder.faults)) == 1
     assert broken_invariants(folder) == []
-    assert job.log.read_text().count("the driver was killed by SIGKILL at") == 2
+    assert job.log.read_text().count("the driver was killed by SIGKILL at") == 1
