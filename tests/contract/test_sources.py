@@ -1,6 +1,7 @@
-"""What no source of ours may do: read pickle, hand anything to a shell, or print a name as rich's markup."""
+"""What no source may do (read pickle, hand anything to a shell, print a name as rich's markup), and what is committed."""
 
 import ast
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -52,3 +53,13 @@ def test_consoles_show_text_as_it_is(path):
 
 def test_there_are_sources():
     assert len(SOURCES) > 80
+
+
+def test_the_top_level_holds_what_it_shall_and_nothing_that_a_run_leaves():
+    words = ["git", "-C", str(ROOT), "ls-files", "--cached"]
+    found = {line.split("/")[0] for line in subprocess.run(words, capture_output=True, text=True).stdout.splitlines()}
+    if not found:
+        pytest.skip("the sources are no git checkout")
+    folders = {"sim_core", "actors", "learner", "deploy", "dashboards", "tests"}
+    files = {"pyproject.toml", "README.md", "CHANGELOG.md", "Makefile"}
+    assert {name for name in found if not name.startswith(".")} == folders | files

@@ -22,6 +22,7 @@ from learner.run_end import RunEnd
 from learner.run_folder import RunFolder
 from learner.sweep.cell import SweepLocation, run_cell
 from learner.sweep.grid import Cell, SweepConfig
+from learner.tracking.mlflow_run import Tracker
 from tests.dying import Killed, Places, writes_seen
 from tests.integration.conftest import PATIENCE_S, SMALL, clean_environment, flags
 from tests.integration.jobs import Job
@@ -132,6 +133,7 @@ def test_a_cell_that_is_killed_at_every_place_of_its_end_has_the_results_of_a_wh
     monkeypatch.setattr("learner.run.LAST_FLUSH_S", 0.5)
     uri, config = f"sqlite:///{tmp_path}/mlflow.db", dataclasses.replace(SHORT, final_eval_first_seed=77)
     cell, place = Cell("cut", config), SweepLocation(tmp_path / "s" / "cells", uri, "cells")
+    Tracker(uri, "cells", str(tmp_path / "artifacts"))  # as a sweep does; without it they would lie in this folder
     expected = run_cell(SWEEP, cell._replace(key="whole"), place, id).read_text()
     with monkeypatch.context() as patch, pytest.raises(Killed):
         patch.setattr(RunEnd, "begin", die)
