@@ -1,4 +1,4 @@
-"""What no source may do (read pickle, hand anything to a shell, print a name as rich's markup), and what is committed."""
+"""What no source may do (read pickle, use a shell, print a name as rich's markup), and what is committed."""
 
 import ast
 import subprocess
