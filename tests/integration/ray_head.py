@@ -145,18 +145,11 @@ def copy_of_the_code(folder: Path) -> Path:
 
 
 def submit(
-    head: Head,
-    checkout: Path,
-    config: RunConfig,
-    runs: Path,
-    log: Path,
-    *options: str,
-    cwd: Path | None = None,
-    of_train: Sequence[str] = (),
+    head: Head, checkout: Path, config: RunConfig, runs: Path, log: Path, *options: str, cwd: Path | None = None
 ) -> subprocess.Popen:
     """`shoal submit train` in the background, from the folder `cwd`, the checkout by default."""
     place = ["--address", head.address, "--working-dir", str(checkout)]
-    words = ["submit", *place, *options, "train", "--runs-dir", str(runs), *flags(config), *of_train]
+    words = ["submit", *place, *options, "train", "--runs-dir", str(runs), *flags(config)]
     with log.open("w") as file:
         return subprocess.Popen(
             [sys.executable, "-W", "error::DeprecationWarning:__main__", "-m", "deploy", *words],

@@ -27,7 +27,7 @@ pytestmark = [
 
 HEAD, FAR = "10.78.1.1", "10.78.1.2"
 DELAY_MS = 5.0
-MOMENT_S, LONG_S = 3.0, 45.0
+MOMENT_S, LONG_S = 3.0, 35.0
 QUICK = {
     "health_check_initial_delay_ms": 1000,
     "health_check_period_ms": 1000,

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import mlflow
-import psutil
 import pytest
 
 import deploy
@@ -95,22 +94,6 @@ def test_stop_saves_a_checkpoint_and_the_same_command_goes_on(head, checkout, tm
     code, text = finish(submitted(log), log)
     assert code == 0 and "has finished before" in text, text
     assert the_run(runs).data.tags["attempts"] == "2"
-
-
-def test_a_supervised_job_goes_on_when_its_driver_is_killed(head, checkout, tmp_path):
-    runs, log = tmp_path / "runs", tmp_path / "log"
-    job = submit(head, checkout, LONG, runs, log, of_train=["--supervise"])
-    wait_for(lambda: bool(list(runs.glob("*/checkpoints/step-*[0-9]"))), log.read_text, job)
-    words = {process: process.info["cmdline"] or [] for process in psutil.process_iter(["cmdline"])}
-    (supervisor,) = (
-        process for process, line in words.items() if "deploy.supervisor" in line and str(runs) in " ".join(line)
-    )
-    (driver,) = supervisor.children()
-    driver.kill()
-    code, text = finish(job, log)
-    assert code == 0, text
-    assert "shoal: the driver was killed by SIGKILL at" in text and "going on from" in text
-    assert (the_run(runs).info.status, the_run(runs).data.tags["attempts"]) == ("FINISHED", "2")
 
 
 def test_what_git_ignores_is_not_uploaded(head, checkout, tmp_path):

@@ -35,6 +35,11 @@ def test_the_job_runs_the_given_command_in_a_folder_that_outlasts_it(monkeypatch
     assert there.or_resume and there.launch.name == run_name(job)
 
 
+def test_a_job_may_be_supervised():
+    command, job = submitted("train", "--supervise", "--robots", "5")
+    assert parse(job_arguments(command.arguments, job)).supervise and job.supervise
+
+
 def test_a_jobs_name_is_decided_by_its_settings():
     names = {}
     for arguments in ("", "--robots 10", "--total-env-steps 9000000", "--robots 5", "--seed 1", "--learning-rate 0.1"):
