@@ -154,7 +154,7 @@ class DrivenRun:
         """The score sheet: the next scene (None at the end), all results of driven scenes, and every player's line."""
         players = (PERSON, *self._others)
         driven = [number for number in range(SCENES) if self._store(number).exists()]
-        results = {number: {player: self._result(number, player) for player in players} for number in driven}
+        results = {number: {player: self._play(number, player).result for player in players} for number in driven}
         totals = [total(player, [each[player] for each in results.values()]) for player in players if results]
         rows = [
             {"number": number, "results": {player: result._asdict() for player, result in each.items()}}
@@ -250,9 +250,6 @@ class DrivenRun:
         if (number, player) not in self._played:
             self._played[number, player] = played(self._recorded(number, player), self._world)
         return self._played[number, player]
-
-    def _result(self, number: int, player: str) -> Result:
-        return self._play(number, player).result
 
 
 def _direction(x: Any, y: Any) -> NDArray[np.float32]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import shlex
 import signal
-from collections.abc import Callable
-from functools import partial
 
 from deploy.console.summary_tables import evaluation_table, setups_table, summary_lines
 from deploy.console.terminal import plain_console
@@ -98,7 +96,12 @@ def run_training(
     console.print(f"run {folder.path}", soft_wrap=True)
     try:
         with make_display(console, config.total_env_steps) as display:
-            steps = partial(_artifact_steps, folder, config, tracker, display.message)
+
+            def steps(result: RunResult, rows: list[Row]) -> list[Step]:
+                from deploy.runs.artifacts import artifact_steps  # at the end, since it imports matplotlib
+
+                return artifact_steps(folder, config, tracker, display.message, result, rows)
+
             result = RunSession(folder, config, tracker, display, options, opened).execute(checkpoint, steps)
     except Interrupted as interrupted:
         return _stopped(folder, interrupted.signal, "")
@@ -107,19 +110,6 @@ def run_training(
         return _stopped(folder, result.stopped_by or 0, f" at {result.env_steps:,} env steps; {saved}")
     _show(folder, config, tracker, result)
     return 0
-
-
-def _artifact_steps(
-    folder: RunFolder,
-    config: RunConfig,
-    tracker: Tracker,
-    message: Callable[[str], None],
-    result: RunResult,
-    rows: list[Row],
-) -> list[Step]:
-    from deploy.runs.artifacts import artifact_steps  # at the end, since it imports matplotlib
-
-    return artifact_steps(folder, config, tracker, message, result, rows)
 
 
 def _stopped(folder: RunFolder, number: int, where: str) -> int:

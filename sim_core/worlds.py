@@ -105,6 +105,7 @@ class WorldBatch:
         self._senses = Senses(config, self._known) if impaired else None
         self._shield = Shield(config) if shielded else None
         self._unicycle = Unicycle(config, num_rows) if is_unicycle else None
+        self._drives_as_asked = not (impaired or shielded or is_unicycle)
         self.sensed: WorldState = self._known if self._senses is None else self._senses.sensed
         self.asked = np.zeros((2, num_rows), np.float32)
         self._command = np.zeros((2, num_rows), np.float32)
@@ -255,17 +256,16 @@ class WorldBatch:
 
     def _give_command(self, action: Decision) -> bool:
         """Writes the velocities that the learning robots drive; returns False where FL-ORCA drives as it is."""
-        command, stages = self._command, (self._senses, self._shield, self._unicycle)
-        as_asked = all(stage is None for stage in stages)
+        command = self._command
         if isinstance(action, Pilot):
-            if as_asked:
+            if self._drives_as_asked:
                 return False
             command[:] = self._swarm_velocity()
         elif isinstance(action, Command):
             command[:] = action.velocity
         else:
             self.method.velocity(self.sensed, action, self._command_x, self._command_y)
-        if as_asked:
+        if self._drives_as_asked:
             return True
         self.asked[:] = command
         if self._shield is not None:

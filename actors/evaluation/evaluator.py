@@ -86,7 +86,7 @@ def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> EpisodeSt
     """
     if spec.shares:
         return _evaluate_in_turn(spec, candidate, np.array(seeds, np.int64))
-    most = max(1, MAX_ENVS // (spec.world.num_learners if spec.is_swarm else 1))
+    most = max(1, MAX_ENVS // spec.learners()[0])
     chunks = [seeds[i : i + most] for i in range(0, len(seeds), most)]
     return join_stats([_play(spec, make_action_rule(spec, candidate, chunk), chunk) for chunk in chunks])
 
@@ -96,7 +96,7 @@ def _evaluate_in_turn(spec: EnvSpec, candidate: Candidate, seeds: NDArray[np.int
     order = np.argsort(seeds % len(worlds), kind="stable")
     parts = [seeds[seeds % len(worlds) == i].tolist() for i in range(len(worlds))]
     played = [evaluate(spec.of_setup(world), candidate, part) for world, part in zip(worlds, parts, strict=True)]
-    learners = np.array([world.num_learners for world in worlds])[seeds[order] % len(worlds)]
+    learners = np.array(spec.learners())[seeds[order] % len(worlds)]
     first = np.cumsum(learners) - learners  # entry of each seed, setup after setup
     places = [np.arange(first[at], first[at] + learners[at]) for at in np.argsort(order)]
     return select_stats(join_stats(played), np.concatenate(places))

@@ -50,14 +50,19 @@ def comparison_rows(rivals: dict[str, Results]) -> tuple[list[str], list[list[st
     return header, [_comparison_row(list(rivals.values()), method) for method in methods]
 
 
+def _shared_setups(rivals: Sequence[Results], method: str) -> list[Setup]:
+    """The setups in which all rivals have Fixed results of a method."""
+    return [setup for setup in SETUPS if all(results.fixed(method, setup) is not None for results in rivals)]
+
+
 def _comparison_row(rivals: list[Results], method: str) -> list[str]:
-    shared = [setup for setup in SETUPS if all(results.fixed(method, setup) is not None for results in rivals)]
+    shared = _shared_setups(rivals, method)
     if not shared:
         return [method_label(method), "0", *["–"] * (2 * len(rivals))]
-    rates = [[_success(results, method, setup) for setup in shared] for results in rivals]
-    means = [f"{100 * sum(line) / len(line):.1f} %" for line in rates]
+    measured = [[_measured(results, method, setup) for setup in shared] for results in rivals]
+    means = [_mean(line) for line in measured]
     wins = [0] * len(rivals)
-    for column in zip(*rates, strict=True):
+    for column in zip(*([found.estimate.value for found in line] for line in measured), strict=True):
         best = max(column)
         if column.count(best) == 1:
             wins[column.index(best)] += 1
@@ -81,7 +86,7 @@ def rule_rows(learned: Results, rules: dict[str, Results]) -> tuple[list[str], l
 def _rule_row(learned: Results, rules: dict[str, Results], method: str) -> list[str]:
     own = {name: rule for name, rule in rules.items() if any(rule.fixed(method, setup) for setup in SETUPS)}
     rivals = [learned, *own.values()]
-    shared = [setup for setup in SETUPS if all(results.fixed(method, setup) is not None for results in rivals)]
+    shared = _shared_setups(rivals, method)
     if not own or not shared:
         return [method_label(method), "0", *["–"] * (len(rules) + 4)]
     measured = {name: [_measured(rules[name], method, setup) for setup in shared] for name in own}
@@ -96,10 +101,6 @@ def _rule_row(learned: Results, rules: dict[str, Results], method: str) -> list[
 
 def _mean(found: Sequence[Measurement]) -> str:
     return f"{100 * sum(each.estimate.value for each in found) / len(found):.1f} %"
-
-
-def _success(results: Results, method: str, setup: Setup) -> float:
-    return _measured(results, method, setup).estimate.value
 
 
 def _measured(results: Results, method: str, setup: Setup) -> Measurement:

@@ -34,9 +34,9 @@ from sim_core import ENV_ID
 from sim_core.config import ONE_LEARNER
 from sim_core.outcomes import Outcome
 from sim_core.plugins import DISSERTATION_METHODS
+from tests.benchmarks.learners import SHARES
 from tests.checkpointing import Silent
 
-SHARES = (ONE_LEARNER, "0.25", "0.5", "1.0")
 FIRST_SEED = 2_000_000_000
 
 

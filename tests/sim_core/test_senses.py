@@ -11,10 +11,10 @@ from scipy.stats import kstest, norm
 from sim_core.config import WorldConfig
 from sim_core.jit import kernel
 from sim_core.methods.headings import heading_velocities
-from sim_core.outcomes import Outcome
 from sim_core.pilot import Pilot
 from sim_core.rng import add_normal
 from sim_core.worlds import WorldBatch
+from tests.sim_core.batches import assert_go_on_alike, started
 from tests.sim_core.senses_oracle import Oracle, normal_pair
 
 WORLD = {"robots": 5, "groups": 3, "arena_radius_m": 1.5, "robot_radius_m": 0.06, "orca_radius_m": 0.18}
@@ -37,10 +37,7 @@ NO_EFFECT = {"sensing_range_m": 1e6}
 
 def make(num_worlds, method="sensor", seed=0, **fields):
     """A freshly reset batch."""
-    worlds = WorldBatch(WorldConfig(method=method, **{**WORLD, **fields}), num_worlds)
-    worlds.seed(list(range(seed, seed + num_worlds)))
-    worlds.reset()
-    return worlds
+    return started(WorldConfig(method=method, **{**WORLD, **fields}), num_worlds, seed)
 
 
 def wide(num_worlds, **fields):
@@ -320,14 +317,7 @@ def test_a_saved_batch_goes_on_as_the_one_that_was_not_saved(method):
     for step in range(7):
         worlds.step(np.arange(6) * step % 8)
     np.testing.assert_array_equal(restored.set_state(worlds.get_state()), worlds.observation())
-    for step in range(30):
-        action = np.arange(6) * step % 8
-        one, other = worlds.step(action), restored.step(action)
-        for name, value in one._asdict().items():
-            np.testing.assert_array_equal(getattr(other, name), value, err_msg=name)
-        ended = one.outcome != Outcome.RUNNING
-        if ended.any():
-            np.testing.assert_array_equal(worlds.reset(ended), restored.reset(ended))
+    assert_go_on_alike(worlds, restored, 30)
 
 
 def test_a_mask_may_be_a_view_of_another_array():

@@ -12,6 +12,7 @@ from sim_core.checks import ConfigError
 from sim_core.config import WorldConfig
 from sim_core.outcomes import Outcome
 from sim_core.worlds import Command, Pilot, WorldBatch
+from tests.sim_core.batches import assert_go_on_alike, started
 
 WORLD = WorldConfig(
     robots=5,
@@ -28,10 +29,7 @@ METHODS = ("sensor", "in", "out")
 
 def make(num_worlds, method="sensor", seed=0, **fields):
     """A freshly reset batch."""
-    worlds = WorldBatch(dataclasses.replace(WORLD, method=method, **fields), num_worlds)
-    worlds.seed(list(range(seed, seed + num_worlds)))
-    worlds.reset()
-    return worlds
+    return started(dataclasses.replace(WORLD, method=method, **fields), num_worlds, seed)
 
 
 def driven(worlds):
@@ -143,14 +141,7 @@ def test_a_saved_batch_goes_on_as_the_one_that_was_not_saved(method):
     for step in range(9):
         worlds.step(np.arange(6) * step % 8)
     restored.set_state(worlds.get_state())
-    for step in range(40):
-        action = np.arange(6) * step % 8
-        one, other = worlds.step(action), restored.step(action)
-        for name, value in one._asdict().items():
-            np.testing.assert_array_equal(getattr(other, name), value, err_msg=name)
-        ended = one.outcome != Outcome.RUNNING
-        if ended.any():
-            np.testing.assert_array_equal(worlds.reset(ended), restored.reset(ended))
+    assert_go_on_alike(worlds, restored, 40)
 
 
 @pytest.mark.parametrize("method", METHODS)
