@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 import math
 import typing
@@ -37,7 +38,7 @@ def require_packages(purpose: str, extra: str, *packages: str) -> None:
         require(found, f"{purpose} needs the package {name}: install it with `pip install 'shoal[{extra}]'`")
 
 
-def check_fields(config: Any) -> None:
+def check_fields(config: object) -> None:
     """Checks the bool, int, float, str and Literal fields of a config dataclass; it ignores fields of other types.
 
     Numpy's scalars become plain ones of Python, which JSON and hashes of configs know.
@@ -45,9 +46,8 @@ def check_fields(config: Any) -> None:
     Raises:
       ConfigError: a value has the wrong type, is not finite, or is none of its field's choices.
     """
-    hints = typing.get_type_hints(type(config))
-    for field in dataclasses.fields(config):
-        wanted, value = hints[field.name], getattr(config, field.name)
+    for field, wanted in _typed_fields(type(config)):  # type: ignore[arg-type]  # a class has a hash
+        value = getattr(config, field.name)
         if isinstance(value, np.generic) and value.ndim == 0:
             value = value.item()
             object.__setattr__(config, field.name, value)
@@ -63,6 +63,12 @@ def check_fields(config: Any) -> None:
         elif wanted in (bool, str):
             name = "true or false" if wanted is bool else "a string"
             require(isinstance(value, wanted), f"{field.name} must be {name}, not {value!r}")
+
+
+@functools.cache
+def _typed_fields(kind: Any) -> list[tuple[dataclasses.Field[Any], Any]]:
+    hints = typing.get_type_hints(kind)  # evaluates every annotation, which takes milliseconds
+    return [(field, hints[field.name]) for field in dataclasses.fields(kind)]
 
 
 def _is_finite_number(value: Any) -> bool:

@@ -19,10 +19,19 @@ INDEPENDENT = ("test_faults.py", "test_peers.py", "test_process_run.py", "test_r
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Shares modules out among pytest-xdist's processes, so that each makes a module's fixtures once."""
+    """Shares modules out among pytest-xdist's processes, so that each makes a module's fixtures once.
+
+    The last process takes modules from the end of the queue, where those that compute stand, while the others take those
+    with a Ray, which wait more than they compute.
+    """
     from xdist.scheduler import LoadScopeScheduling
 
     class ByModule(LoadScopeScheduling):  # type: ignore[misc]
+        def _assign_work_unit(self, node: Any) -> None:
+            if node is self.nodes[-1] and len(self.nodes) > 1:
+                self.workqueue.move_to_end(next(reversed(self.workqueue)), last=False)
+            super()._assign_work_unit(node)
+
         def _split_scope(self, nodeid: str) -> str:
             module, test_or_class, *_ = nodeid.split("::")
             is_divided = module.removeprefix("tests/integration/") in INDEPENDENT
@@ -32,9 +41,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Begins with the longest tests in pytest-xdist's processes: those with a Ray, then other slow ones."""
+    """Puts tests with a Ray at the beginning of pytest-xdist's queue, and other slow ones at its end."""
     if hasattr(config, "workerinput"):
-        items.sort(key=lambda item: [item.get_closest_marker(name) is None for name in ("ray", "slow")])
+        items.sort(key=lambda item: (not item.get_closest_marker("ray"), bool(item.get_closest_marker("slow"))))
 
 
 @pytest.fixture(scope="session")

@@ -66,9 +66,10 @@ class Contender(NamedTuple):
 
 def contests() -> dict[str, Contest]:
     cartpole = from_dict(tomllib.loads((ROOT / "deploy/configs/cartpole.toml").read_text("utf-8")))
-    often = {"eval_every_env_steps": 50_000, "eval_episodes": 200, "checkpoint_every_env_steps": 10**9}
+    often = {"eval_every_env_steps": 10_000, "eval_episodes": 200, "checkpoint_every_env_steps": 10**9}
     seldom = {"total_env_steps": 10**8, "eval_every_env_steps": 10**9, "checkpoint_every_env_steps": 10**9}
-    swarm, wide = RunConfig(), RunConfig(world=WorldConfig(method="in", robots=5, groups=8))
+    swarm = RunConfig(world=WorldConfig(decision_interval_steps=4))  # as the preset `best` decides
+    wide = RunConfig(world=WorldConfig(method="in", robots=5, groups=8))
     return {
         "cartpole": Contest(
             dataclasses.replace(cartpole, batch_size=512, n_step=1, **seldom),
