@@ -6,13 +6,12 @@ and a few dozen bytes per row.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple, get_type_hints
+from typing import NamedTuple
 
-from actors.storage.atomic_write import replacing_file
-from sim_core.checks import ConfigError
+from actors.storage.csv_table import read_csv, write_csv
+from sim_core.checks import require
 from sim_core.outcomes import ENDED, Outcome
 
 ROBOTS = (5, 10, 15, 20, 25)
@@ -67,16 +66,9 @@ def is_drawn(trained: tuple[int, int], played: tuple[int, int]) -> bool:
     return trained in DRAWN_TRAININGS and (more_robots or more_groups)
 
 
-_TYPES: dict[str, Any] = get_type_hints(ResultRow)
-
-
 def write_table(path: Path, rows: Iterable[ResultRow]) -> None:
     """Writes rows in a fixed order to a CSV file; an older file is replaced once the new one is complete."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing_file(path, sync_first=True) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(ResultRow._fields)
-        writer.writerows(sorted(rows))
+    write_csv(path, ResultRow, rows)
 
 
 def read_table(path: Path) -> list[ResultRow]:
@@ -85,23 +77,11 @@ def read_table(path: Path) -> list[ResultRow]:
     Raises:
       ConfigError: the file cannot be read, has other columns, or has a row with impossible counts.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:  # as spreadsheets write it
-            lines = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"the results {path} cannot be read ({error}); name a results.csv of a sweep") from error
-    if not lines or tuple(lines[0]) != ResultRow._fields:
-        raise ConfigError(f"{path} is no table of results: its first line must be {','.join(ResultRow._fields)}")
-    return [_row(line, f"{path}, line {number}") for number, line in enumerate(lines[1:], start=2)]
-
-
-def _row(line: list[str], where: str) -> ResultRow:
-    try:
-        values = [_TYPES[name](text) for name, text in zip(ResultRow._fields, line, strict=True)]
-    except ValueError as error:
-        raise ConfigError(f"{where} is no row of results ({error}); make the table again") from error
-    row = ResultRow(*values)
-    counts = [row.count(outcome) for outcome in ENDED]
-    if min(counts) < 0 or sum(counts) != row.episodes or row.episodes < 1:
-        raise ConfigError(f"{where} counts {sum(counts)} outcomes of {row.episodes} episodes; make the table again")
-    return row
+    rows = read_csv(path, ResultRow, "results", "name a results.csv of a sweep")
+    for number, row in enumerate(rows, start=2):
+        counts = [row.count(outcome) for outcome in ENDED]
+        require(
+            min(counts) >= 0 and sum(counts) == row.episodes >= 1,
+            f"{path}, line {number} counts {sum(counts)} outcomes of {row.episodes} episodes; make the table again",
+        )
+    return rows

@@ -21,12 +21,18 @@ def presets_of(rows: Sequence[ResultRow]) -> list[str]:
     return sorted({row.preset for row in rows if row.policy == LEARNED}, key=lambda name: (name != "thesis", name))
 
 
-def results_of(rows: Sequence[ResultRow]) -> dict[str, Results]:
-    """The results of each preset, in the order of `presets_of`; a preset knows those of its variants among them."""
+def results_of(rows: Sequence[ResultRow], beside: Sequence[ResultRow] = ()) -> dict[str, Results]:
+    """The results of each preset, in the order of `presets_of`; a preset knows those of its variants.
+
+    Args:
+      rows: of all presets to show; some may be variants of others.
+      beside: rows of further variants, which are compared with and not shown.
+    """
     names, found = presets_of(rows), dict[str, Results]()
-    for name in sorted(names, key=len, reverse=True):  # variants have longer names than what they vary
+    known = [*rows, *(row for row in beside if row.preset not in names)]
+    for name in sorted(presets_of(known), key=len, reverse=True):  # variants have longer names than what they vary
         variants = {other.removeprefix(f"{name}+"): found[other] for other in found if other.startswith(f"{name}+")}
-        found[name] = Results((row for row in rows if row.preset == name), variants)
+        found[name] = Results((row for row in known if row.preset == name), variants)
     return {name: found[name] for name in names}
 
 

@@ -16,6 +16,7 @@ from dashboards.figures.style import save_png
 from dashboards.report import DRAWINGS, PresetSection, report_markdown
 from deploy.console.terminal import plain_console
 from deploy.options.results import Report
+from deploy.report_data.beside import variants_beside
 from deploy.runs.folders import make_folder, write_text
 from deploy.runs.sweep_provenance import read_provenance
 from learner.sweep.grid import world_of_label
@@ -31,7 +32,7 @@ def run(command: Report) -> int:
     """
     tables = command.results
     rows = list(dict.fromkeys(row for table in tables for row in read_table(table)))  # sweeps may share baselines
-    presets = results_of(rows)
+    presets = results_of(rows, variants_beside(tables))
     require(bool(presets), f"{', '.join(map(str, tables))} holds no results of a learned policy; run a sweep first")
     sections = []
     for preset, results in presets.items():

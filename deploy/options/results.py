@@ -21,7 +21,8 @@ class Report:
     """Draw figures and judge the dissertation's claims from a sweep's table of results."""
 
     results: Positional[tuple[Path, ...]]
-    """Tables of results: a results.csv of `shoal sweep`, or of dashboards/results. Several are shown side by side."""
+    """Tables of results: a results.csv of `shoal sweep`, or of dashboards/results. Several are shown side by side; a
+    variants.csv beside one, a table of its preset with other settings, is compared with."""
     out: Path = Path("runs/report")
     """Folder for report.md, claims.md and the figures."""
 

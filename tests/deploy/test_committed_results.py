@@ -14,6 +14,7 @@ from actors.evaluation.result_table import LEARNED, read_table
 from deploy.cli import main
 from deploy.runs.sweep_provenance import grid_of, read_provenance
 from learner.config import RunConfig, to_dict
+from learner.file_names import RESULTS, SETTINGS, VARIANTS
 from learner.sweep.grid import expected_hash, make_cell, sweep_of_label
 
 ROOT = Path(dashboards.__file__).parent / "results"
@@ -41,10 +42,8 @@ def test_the_provenance_of_the_results_is_known(folder):
 def test_the_committed_report_is_that_of_the_results(folder, tmp_path):
     assert main(["report", str(folder / "results.csv"), "--out", str(tmp_path)]) == 0
     made = {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()}
-    assert made == {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()} - {
-        Path("results.csv"),
-        Path("settings.json"),
-    }
+    committed = {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
+    assert made == committed - {Path(name) for name in (RESULTS, SETTINGS, VARIANTS)}
     for name in made:
         if name.suffix == ".md":
             assert (folder / name).read_text() == (tmp_path / name).read_text()
@@ -77,6 +76,15 @@ def test_no_default_has_changed_since_the_results(folder):
         for name in values.keys() - {"world", "seed"} & RunConfig.__dataclass_fields__.keys():
             assert now[name] == values[name], name
         assert {name: now["world"][name] for name in values["world"]} == values["world"]
+
+
+def test_variants_have_the_settings_of_their_labels():
+    (table,) = ROOT.glob(f"*/{VARIANTS}")
+    told = [each.command for each in read_provenance(table)]
+    for row in read_table(table):
+        sweep = sweep_of_label(row.preset)
+        assert sweep.set and any(f"--set {' '.join(sweep.set)} " in command for command in told)
+        assert row.config == expected_hash(dataclasses.replace(sweep, episodes=1000, baseline_episodes=500), row)
 
 
 TRIED = sorted((ROOT / "tried").glob("*.csv"))

@@ -9,10 +9,12 @@ import pytest
 
 from actors.evaluation.result_table import ResultRow, write_table
 from dashboards.analysis.aggregate import Setup
+from dashboards.analysis.statements import NO_FIELD
 from dashboards.figures.result_figures import PICTURES
 from dashboards.report import DRAWINGS
 from deploy.commands import report
 from deploy.options.results import Report
+from learner.file_names import VARIANTS
 from sim_core.checks import ConfigError
 from tests.dashboards.tables import claimed_table, row
 
@@ -99,6 +101,15 @@ def test_several_tables_are_shown_side_by_side(both: dict[str, bytes], tmp_path:
     names = ", ".join(f"`{tmp_path.name}/{table.name}`" for table in tables)
     assert page.replace(names, "`results.csv`") == both["report.md"].decode()
     assert re.search(r"^\| 14 \| .* \| holds \(10 of 10\) \| no data \(1 of 10\) \|$", page, re.MULTILINE)
+
+
+@pytest.mark.usefixtures("unsaved")
+def test_variants_beside_the_table_decide_what_it_cannot(tmp_path: Path):
+    assert re.search(r"^\| 24 \| .* \| no data \|", made(claimed_table(), tmp_path)["report.md"].decode(), re.MULTILINE)
+    write_table(tmp_path / VARIANTS, [row("out", Setup(5, 1), success=70, preset=f"thesis+{NO_FIELD}")])
+    page = made(claimed_table(), tmp_path)["report.md"].decode()
+    assert re.search(r"^\| 24 \| .* \| \*\*does not hold\*\* \| 5r×1g 70.0 %", page, re.MULTILINE)
+    assert page.count("## Preset ") == 1 and NO_FIELD not in page
 
 
 @pytest.mark.usefixtures("unsaved")
