@@ -43,14 +43,16 @@ types: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-kernels: $(READY)
+# While the packages that tests add are being installed.
+kernels: $(RUNTIME)
 	$(BIN)/python -m tests.precompile
 
-# Style, types, import rules, then all tests. ARGS goes to pytest, which runs WORKERS processes. Four on two cores are too
-# many: each starts a Ray of its own, and a machine that is that busy misses deadlines.
-WORKERS ?= 2
-test: style
-	$(MAKE) --no-print-directory --jobs 2 types kernels
+# Style, types, import rules, then all tests. ARGS goes to pytest, which runs WORKERS processes: two with a Ray, which
+# wait more than they compute, and one that computes. Four on two cores are too many: a machine that is that busy misses
+# deadlines.
+WORKERS ?= 3
+test: $(RUNTIME)
+	$(MAKE) --no-print-directory --jobs 2 kernels lint
 	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder $(ARGS)
 
 # Renews .ci/constraints.txt: the newest releases that pyproject.toml admits. ARGS="torch==2.13.0" holds one back.

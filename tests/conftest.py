@@ -21,8 +21,8 @@ INDEPENDENT = ("test_faults.py", "test_peers.py", "test_process_run.py", "test_r
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Shares modules out among pytest-xdist's processes, so that each makes a module's fixtures once.
 
-    The last process takes modules from the end of the queue, where those that compute stand, while the others take those
-    with a Ray, which wait more than they compute.
+    The last process takes modules from the end of the queue, where those that compute stand, while the others take
+    those with a Ray, which wait more than they compute.
     """
     from xdist.scheduler import LoadScopeScheduling
 

@@ -27,7 +27,7 @@ WIDE = dataclasses.replace(
     workers=3,
     replay_shards=2,
     replay_placement="actors",
-    total_env_steps=90_000,
+    total_env_steps=60_000,
     checkpoint_every_env_steps=5_000,
 )
 """Six parts on three nodes of two CPUs."""
