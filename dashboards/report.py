@@ -12,7 +12,7 @@ from dashboards.analysis.comparison import BASELINES_NOTE, comparison_rows, rule
 from dashboards.analysis.methods import in_order
 from dashboards.figures.diagrams import DIAGRAMS
 from dashboards.figures.example_episodes import EXAMPLES
-from dashboards.figures.result_figures import PICTURES
+from dashboards.figures.result_figures import pictures_of
 
 DRAWINGS = (*EXAMPLES, *DIAGRAMS)
 """Figures drawn from simulated worlds, in addition to those of results."""
@@ -105,7 +105,7 @@ def _preset_section(section: PresetSection) -> list[str]:
         lines += ["### Learned policies beside rules that learn nothing", "", BASELINES_NOTE, ""]
         lines += [*table_of(*rule_rows(section.results, section.baselines)), ""]
     lines += ["### Figures", ""]
-    for picture in PICTURES:
+    for picture in pictures_of(section.results):
         lines += [f"![{picture.alt}, preset {section.name}]({section.folder}{picture.file})", ""]
     return lines
 

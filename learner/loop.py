@@ -220,7 +220,7 @@ class TrainingLoop:
     def _start_evaluation(self) -> None:
         seeds = list(range(EVAL_SEED, EVAL_SEED + self._config.eval_episodes))
         weights = by_reference(self._supervisor.weights_ref())
-        ref = self._calls.run(evaluate, self._config.env, weights, seeds)
+        ref = self._calls.run(evaluate, self._config.env, weights, seeds, self._config.decision_discount)
         take = partial(self._take_evaluation, self.env_steps)
         self._in_flight.add(PendingCall("eval", EVALUATOR, self._supervisor.incarnation(EVALUATOR), ref, take))
 

@@ -32,7 +32,7 @@ _COLUMNS: list[Any] = [
 ]
 EPISODE_DTYPE = np.dtype(_COLUMNS)
 TEAM_NAMES = TEAM_DTYPE.names or ()
-_OF_EPISODES = tuple(name for name in EpisodeStats._fields if name != "team")
+_OF_EPISODES = tuple(name for name in EpisodeStats._fields if name not in ("team", "values"))
 TEAM_EPISODE_DTYPE = np.dtype([*_COLUMNS, *TEAM_DTYPE.descr])
 
 

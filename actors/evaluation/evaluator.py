@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from actors.evaluation.recording import Recording
 from actors.evaluation.trajectory import Episode
+from actors.evaluation.value_meter import ValueMeter
 from actors.policy.baselines import ActionRule, Baseline, make_baseline
 from actors.policy.policy import Policy, WeightsSnapshot
 from actors.rollout.env_spec import EnvSpec
@@ -25,7 +26,7 @@ from actors.rollout.foreign_spaces import shown
 from actors.rollout.vector_env import make_vector_env, reset_seeded
 from actors.rollout.worker import join_stats, select_stats
 from actors.service.fault_policy import Action, CallFailed, ComponentKind, decide
-from actors.service.messages import NO_OUTCOME, NO_TEAM, TEAM_DTYPE, EpisodeStats
+from actors.service.messages import NO_OUTCOME, NO_TEAM, NO_VALUES, TEAM_DTYPE, EpisodeStats
 from actors.service.rpc import Calls, Ref, by_reference
 from sim_core.checks import require
 from sim_core.config import ONE_LEARNER, WorldConfig
@@ -62,6 +63,10 @@ class GreedyPolicy:
         """Greedy actions `[batch]` for observations `[batch, *shape]`; the lowest index among equals."""
         return self._policy.greedy(observation)
 
+    def values(self) -> NDArray[np.float32]:
+        """Values `[batch]` of the actions of the last call of `act`."""
+        return self._policy.highest_values()
+
 
 def make_action_rule(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> ActionRule:
     """Makes the action rule of a candidate for one episode per seed, all played together.
@@ -75,8 +80,14 @@ def make_action_rule(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> A
     return make_baseline(candidate, spec.world, seeds)
 
 
-def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> EpisodeStats:
+def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int], discount: float | None = None) -> EpisodeStats:
     """Plays one episode per seed; of n setups, in that of index seed modulo n.
+
+    Args:
+      spec: the environment.
+      candidate: who plays.
+      seeds: of the episodes.
+      discount: per decision, to have the values that a policy expects beside the returns that it gets.
 
     Returns:
       One entry per seed, in order; one per learning robot of each seed's world where several learn.
@@ -85,17 +96,20 @@ def evaluate(spec: EnvSpec, candidate: Candidate, seeds: list[int]) -> EpisodeSt
       ConfigError: see `make_action_rule`.
     """
     if spec.shares:
-        return _evaluate_in_turn(spec, candidate, np.array(seeds, np.int64))
+        return _evaluate_in_turn(spec, candidate, np.array(seeds, np.int64), discount)
     most = max(1, MAX_ENVS // spec.learners()[0])
     chunks = [seeds[i : i + most] for i in range(0, len(seeds), most)]
-    return join_stats([_play(spec, make_action_rule(spec, candidate, chunk), chunk) for chunk in chunks])
+    return join_stats([_play(spec, make_action_rule(spec, candidate, chunk), chunk, discount) for chunk in chunks])
 
 
-def _evaluate_in_turn(spec: EnvSpec, candidate: Candidate, seeds: NDArray[np.int64]) -> EpisodeStats:
+def _evaluate_in_turn(
+    spec: EnvSpec, candidate: Candidate, seeds: NDArray[np.int64], discount: float | None
+) -> EpisodeStats:
     worlds = spec.worlds
     order = np.argsort(seeds % len(worlds), kind="stable")
     parts = [seeds[seeds % len(worlds) == i].tolist() for i in range(len(worlds))]
-    played = [evaluate(spec.of_setup(world), candidate, part) for world, part in zip(worlds, parts, strict=True)]
+    setups = [spec.of_setup(world) for world in worlds]
+    played = [evaluate(setup, candidate, part, discount) for setup, part in zip(setups, parts, strict=True)]
     learners = np.array(spec.learners())[seeds[order] % len(worlds)]
     first = np.cumsum(learners) - learners  # entry of each seed, setup after setup
     places = [np.arange(first[at], first[at] + learners[at]) for at in np.argsort(order)]
@@ -255,21 +269,26 @@ class _GymEpisodes:
         self._env.close()
 
 
-def _play(spec: EnvSpec, rule: ActionRule, seeds: list[int]) -> EpisodeStats:
+def _play(spec: EnvSpec, rule: ActionRule, seeds: list[int], discount: float | None) -> EpisodeStats:
     episodes = _SwarmEpisodes(spec.world, seeds) if spec.is_swarm else _GymEpisodes(spec, seeds)
     count = episodes.num_episodes
     stats = EpisodeStats(np.full(count, NO_OUTCOME, np.int8), np.zeros(count, np.int32), np.zeros(count))
+    meter = None
+    if discount is not None and isinstance(rule, GreedyPolicy):
+        meter = ValueMeter(rule.values, count, discount)
     observation = episodes.start()
     running = np.ones(count, np.bool_)
     while running.any():
         observation, reward, done, outcome, steps = episodes.step(rule.act(observation))
+        if meter is not None:
+            meter.add(reward, running)
         stats.episode_return[running] += reward[running]
         ended = running & done
         stats.outcome[ended], stats.length_steps[ended] = outcome[ended], steps[ended]
         running &= ~ended
-    team = episodes.team()
+    stats = stats._replace(team=episodes.team(), values=NO_VALUES if meter is None else meter.values())
     episodes.close()
-    return stats._replace(team=team)
+    return stats
 
 
 def record_episode(spec: EnvSpec, candidate: Candidate, seed: int, number: int | None = None) -> Episode:

@@ -71,6 +71,11 @@ class Policy:
         _greedy(self._layers, self._workspace, actions)
         return actions
 
+    def highest_values(self) -> NDArray[np.float32]:
+        """The highest action value `[batch]` of each observation of the last call."""
+        highest: NDArray[np.float32] = self._workspace[-1].max(axis=1)
+        return highest
+
     def _load(self, observation: NDArray[np.generic]) -> None:
         count = len(observation)
         if len(self._room[0]) < count:

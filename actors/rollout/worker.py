@@ -201,5 +201,5 @@ def join_stats(stats: list[EpisodeStats]) -> EpisodeStats:
 
 def select_stats(stats: EpisodeStats, rows: NDArray[Any] | slice) -> EpisodeStats:
     """The episodes of `rows`: a mask, indices or a slice."""
-    outcome, length_steps, episode_return, team = stats
-    return EpisodeStats(outcome[rows], length_steps[rows], episode_return[rows], team[rows] if len(team) else team)
+    columns: list[NDArray[Any]] = [column[rows] if len(column) else column for column in stats]
+    return EpisodeStats(*columns)

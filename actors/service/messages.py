@@ -25,19 +25,29 @@ TEAM_DTYPE = np.dtype([("learners", np.int32), ("segregation", np.float32), ("hi
 groups that were segregated (Eq. 3.1), and whether this robot's episode ended in a collision with one that learns."""
 NO_TEAM = np.zeros(0, TEAM_DTYPE)
 
+VALUE_DTYPE = np.dtype(
+    [(name, np.float64) for name in ("q_start", "return_start", "q_visited", "return_visited")],
+)
+"""What a policy expects of one greedy episode, beside what it gets, in units of reward: the value of the first action,
+and the discounted return that follows; means over all states of the values of the actions taken there, and of the
+discounted returns that follow (van Hasselt et al. 2016, Section 4). What would come after a cut is not counted."""
+NO_VALUES = np.zeros(0, VALUE_DTYPE)
+
 
 class EpisodeStats(NamedTuple):
     """Statistics of finished episodes `[episodes]`: outcome, length, and undiscounted return.
 
     The length counts simulator steps in the swarm environment, env steps in others. Where several robots of a world
     learn, each has an episode, and those of a world stand together; `team` `[episodes]` TEAM_DTYPE tells of their world
-    in an evaluation, and is empty otherwise.
+    in an evaluation, and is empty otherwise. `values` `[episodes]` VALUE_DTYPE tells what a policy expected, if an
+    evaluation was asked for it, and is empty otherwise.
     """
 
     outcome: NDArray[np.int8]
     length_steps: NDArray[np.int32]
     episode_return: NDArray[np.float64]
     team: NDArray[np.void] = NO_TEAM
+    values: NDArray[np.void] = NO_VALUES
 
 
 class BlockHeader(NamedTuple):

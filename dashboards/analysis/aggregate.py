@@ -24,6 +24,7 @@ from scipy.stats import norm
 from actors.evaluation import statistics as estimates
 from actors.evaluation.result_table import GROUPS, LEARNED, ROBOTS, ResultRow
 from actors.evaluation.statistics import Estimate, dispersion
+from actors.evaluation.value_table import ValueRow
 from dashboards.analysis.methods import in_order
 from sim_core.checks import require
 from sim_core.outcomes import ENDED, Outcome
@@ -149,13 +150,20 @@ class Results:
     Args:
       rows: its rows; those of baselines are left out.
       variants: results of the preset with settings that override it, by the settings.
+      values: what its trainings expected beside what they got.
 
     Raises:
       ConfigError: two rows hold the same policy in the same setup.
     """
 
-    def __init__(self, rows: Iterable[ResultRow], variants: Mapping[str, Results] = MappingProxyType({})) -> None:
+    def __init__(
+        self,
+        rows: Iterable[ResultRow],
+        variants: Mapping[str, Results] = MappingProxyType({}),
+        values: Sequence[ValueRow] = (),
+    ) -> None:
         self.variants = variants
+        self.values = values
         found: dict[tuple[str, Setup, Setup], list[ResultRow]] = {}
         for row in sorted(rows):
             if row.policy == LEARNED:

@@ -48,12 +48,20 @@ class Verdict(enum.StrEnum):
     NO_DATA = "no data"
 
 
+class Unit(enum.StrEnum):
+    """In what a quantity is shown: a rate, a difference of rates, or a reward (the dissertation's tau is 1)."""
+
+    PERCENT = "%"
+    POINTS = "points"
+    REWARD = "τ"
+
+
 class Check(NamedTuple):
     """One quantity of a claim and the range [low, high] in which the claim puts it.
 
     Fields: name, short and unique in its claim; the range in words; the measured quantity, None without data; its
-    limits; whether the value alone decides (`≈`); whether the quantity is a difference, shown in points; the setup of
-    the check, if the claim is about every setup; what would give data that no table of results holds.
+    limits; whether the value alone decides (`≈`); in what it is shown; the setup of the check, if the claim is about
+    every setup; what would give data that no table of results holds.
     """
 
     name: str
@@ -62,7 +70,7 @@ class Check(NamedTuple):
     low: float = -math.inf
     high: float = math.inf
     by_value: bool = False
-    is_difference: bool = False
+    unit: Unit = Unit.PERCENT
     setup: Setup | None = None
     needs: str = ""
 
@@ -139,7 +147,7 @@ def at_most(name: str, measured: Measurement | None, limit: float) -> Check:
 
 def rises(name: str, measured: Measurement | None) -> Check:
     """The difference is greater than 0."""
-    return Check(name, "> 0 points", measured, low=0.0, is_difference=True)
+    return Check(name, "> 0 points", measured, low=0.0, unit=Unit.POINTS)
 
 
 def outperforms(name: str, first: Measurement | None, second: Measurement | None, comparisons: int) -> Check:
@@ -147,12 +155,17 @@ def outperforms(name: str, first: Measurement | None, second: Measurement | None
     tie = first is not None and second is not None and min(first.estimate.value, second.estimate.value) >= NEAR_ALL
     low, wanted = (-ALIKE, f"> −{_plain(ALIKE)} points") if tie else (math.nextafter(0.0, 1.0), "> 0 points")
     compared = for_comparisons(difference(first, second), comparisons)
-    return Check(name, f"{wanted}, by value", compared, low, by_value=True, is_difference=True)
+    return Check(name, f"{wanted}, by value", compared, low, by_value=True, unit=Unit.POINTS)
 
 
 def mostly(name: str, measured: Measurement | None, share: float) -> Check:
     """By its value, the share of cases is at least `share`."""
     return Check(name, f"≥ {_plain(share)} % of them, by value", measured, share, by_value=True)
+
+
+def more_reward(name: str, measured: Measurement | None, needs: str) -> Check:
+    """The difference of rewards is greater than 0."""
+    return Check(name, f"> 0 {Unit.REWARD}", measured, low=0.0, unit=Unit.REWARD, needs=needs)
 
 
 def unmeasured(name: str, wanted: str, needs: str) -> Check:
@@ -162,29 +175,42 @@ def unmeasured(name: str, wanted: str, needs: str) -> Check:
 
 def no_worse(name: str, measured: Measurement | None) -> Check:
     """The difference is greater than -ALIKE."""
-    return Check(name, f"> −{_plain(ALIKE)} points", measured, low=-ALIKE, is_difference=True)
+    return Check(name, f"> −{_plain(ALIKE)} points", measured, low=-ALIKE, unit=Unit.POINTS)
 
 
 def alike(name: str, measured: Measurement | None) -> Check:
     """The difference is between -ALIKE and ALIKE."""
-    return Check(name, f"within ±{_plain(ALIKE)} points", measured, -ALIKE, ALIKE, is_difference=True)
+    return Check(name, f"within ±{_plain(ALIKE)} points", measured, -ALIKE, ALIKE, unit=Unit.POINTS)
 
 
 def _plain(share: float) -> str:
     return f"{100 * share:g}"
 
 
+def signed(number: float, digits: int) -> str:
+    """`+3.1` or `−3.1`."""
+    return f"{number:+.{digits}f}".replace("-", "−")
+
+
 def as_points(estimate: Estimate) -> str:
     """`+3.1 (+1.2 … +5.0) points`."""
-    value, low, high = (f"{100 * number:+.1f}".replace("-", "−") for number in estimate)
-    return f"{value} ({low} … {high}) points"
+    value, low, high = (signed(100 * number, 1) for number in estimate)
+    return f"{value} ({low} … {high}) {Unit.POINTS}"
+
+
+def _as_reward(estimate: Estimate) -> str:
+    value, low, high = (signed(number, 3) for number in estimate)
+    return f"{value} ({low} … {high}) {Unit.REWARD}"
+
+
+_FORMATS = {Unit.PERCENT: as_percent, Unit.POINTS: as_points, Unit.REWARD: _as_reward}
 
 
 def number_text(check: Check) -> str:
     """The measured value with its interval; without data `–`, or what would give them."""
     if check.measured is None:
         return check.needs or "–"
-    return (as_points if check.is_difference else as_percent)(check.measured.estimate)
+    return _FORMATS[check.unit](check.measured.estimate)
 
 
 def with_verdict(checks: Sequence[Check], verdict: Verdict) -> list[Check]:

@@ -114,9 +114,7 @@ def _remark(check: Check) -> str:
 
 def _value_text(check: Check) -> str:
     """The value without its interval."""
-    assert check.measured is not None
-    value = 100 * check.measured.estimate.value
-    return f"{value:+.1f}".replace("-", "−") if check.is_difference else f"{value:.1f} %"
+    return number_text(check).partition(" (")[0]
 
 
 def _names(checks: Sequence[Check]) -> str:

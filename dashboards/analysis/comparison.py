@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from actors.evaluation.result_table import LEARNED, ResultRow
+from actors.evaluation.value_table import ValueRow
 from dashboards.analysis.aggregate import SETUPS, Measurement, Results, Setup, difference, success
 from dashboards.analysis.methods import in_order, method_label
 
@@ -21,18 +22,22 @@ def presets_of(rows: Sequence[ResultRow]) -> list[str]:
     return sorted({row.preset for row in rows if row.policy == LEARNED}, key=lambda name: (name != "thesis", name))
 
 
-def results_of(rows: Sequence[ResultRow], beside: Sequence[ResultRow] = ()) -> dict[str, Results]:
+def results_of(
+    rows: Sequence[ResultRow], beside: Sequence[ResultRow] = (), values: Sequence[ValueRow] = ()
+) -> dict[str, Results]:
     """The results of each preset, in the order of `presets_of`; a preset knows those of its variants.
 
     Args:
       rows: of all presets to show; some may be variants of others.
       beside: rows of further variants, which are compared with and not shown.
+      values: what trainings of the presets expected beside what they got.
     """
     names, found = presets_of(rows), dict[str, Results]()
     known = [*rows, *(row for row in beside if row.preset not in names)]
     for name in sorted(presets_of(known), key=len, reverse=True):  # variants have longer names than what they vary
         variants = {other.removeprefix(f"{name}+"): found[other] for other in found if other.startswith(f"{name}+")}
-        found[name] = Results((row for row in known if row.preset == name), variants)
+        expected = [row for row in values if row.preset == name]
+        found[name] = Results((row for row in known if row.preset == name), variants, expected)
     return {name: found[name] for name in names}
 
 

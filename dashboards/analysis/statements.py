@@ -7,6 +7,7 @@ Where the text leaves a choice, it is read as follows:
 - 22: lost and captured are shares of all episodes, averaged over the five group counts.
 - 24: in every setup in which M_OUT was trained without the field, since the text names no exception.
 - 25: "most of the time": in more than half of the 20 setups with 1 to 4 groups.
+- 26: DQN overestimates, and more than Double DQN: values are above returns, as of `overestimation.py`.
 """
 
 from __future__ import annotations
@@ -37,10 +38,12 @@ from dashboards.analysis.claim_checks import (
     alike,
     at_least,
     at_most,
+    more_reward,
     mostly,
     rises,
     unmeasured,
 )
+from dashboards.analysis.overestimation import overestimation
 from dashboards.analysis.quantities import fall, lost_less_captured, over_fixed, share_above_zero, success_in
 
 FEWER_GROUPS = tuple(setup for setup in SETUPS if setup.groups < GROUPS[-1])
@@ -127,8 +130,12 @@ def _without_field(results: Results) -> list[Check]:
 
 
 def _overestimation(results: Results) -> list[Check]:
-    needs = "needs Q(s0) beside the return, which no table holds"
-    return [unmeasured("overestimation, DQN less Double DQN", "> 0", needs)]
+    needs = "needs the table of `make overestimation` beside it, as `values.csv`"
+    dqn, double_dqn = (overestimation(results.values, algorithm) for algorithm in ("dqn", "double_dqn"))
+    return [
+        more_reward("values less returns, DQN", dqn, needs),
+        more_reward("values less returns, DQN less Double DQN", difference(dqn, double_dqn), needs),
+    ]
 
 
 def _lost_most_of_the_time(results: Results) -> list[Check]:

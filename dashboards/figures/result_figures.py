@@ -32,6 +32,7 @@ from dashboards.analysis.failure_styles import FAILURE_STYLES
 from dashboards.analysis.methods import method_label, method_style
 from dashboards.figures.bar_charts import Series, Subplot, draw_bars, draw_lines, legend
 from dashboards.figures.style import LINE_STYLES, MARKERS, MUTED, TEXT, new_figure
+from dashboards.figures.value_curves import value_curves
 
 FIXED_STYLE, TRANSFER_STYLE = ("#0072B2", "", "o"), ("#E69F00", "////", "s")
 HEAT_MAP, NO_CELL = "cividis", "#F0F0F0"
@@ -239,3 +240,11 @@ PICTURES = (
     Picture("figure-4-4.png", "Figure 4.4: success of the three methods, one chart a robot count", figure_4_4),
     Picture("figure-4-5.png", "Figure 4.5: captured and lost robots of M_sensor and M_OUT by robots", figure_4_5),
 )
+VALUES_PICTURE = Picture(
+    "values.png", "Values that DQN and Double DQN expect during training, and the returns that follow", value_curves
+)
+
+
+def pictures_of(results: Results) -> tuple[Picture, ...]:
+    """The figures of a preset's results: `PICTURES`, and that of values where there are some."""
+    return (*PICTURES, VALUES_PICTURE) if results.values else PICTURES

@@ -11,12 +11,12 @@ from actors.evaluation.result_table import read_table
 from dashboards.analysis.claim_text import claims_markdown, tally
 from dashboards.analysis.claims import judge
 from dashboards.analysis.comparison import baselines_of, results_of
-from dashboards.figures.result_figures import PICTURES
+from dashboards.figures.result_figures import pictures_of
 from dashboards.figures.style import save_png
 from dashboards.report import DRAWINGS, PresetSection, report_markdown
 from deploy.console.terminal import plain_console
 from deploy.options.results import Report
-from deploy.report_data.beside import variants_beside
+from deploy.report_data.beside import values_beside, variants_beside
 from deploy.runs.folders import make_folder, write_text
 from deploy.runs.sweep_provenance import read_provenance
 from learner.sweep.grid import world_of_label
@@ -32,7 +32,7 @@ def run(command: Report) -> int:
     """
     tables = command.results
     rows = list(dict.fromkeys(row for table in tables for row in read_table(table)))  # sweeps may share baselines
-    presets = results_of(rows, variants_beside(tables))
+    presets = results_of(rows, variants_beside(tables), values_beside(tables))
     require(bool(presets), f"{', '.join(map(str, tables))} holds no results of a learned policy; run a sweep first")
     sections = []
     for preset, results in presets.items():
@@ -63,7 +63,7 @@ def _write(out: Path, tables: Sequence[Path], sections: list[PresetSection]) -> 
     for section in sections:
         folder = out / section.folder
         folder.mkdir(parents=True, exist_ok=True)
-        for picture in PICTURES:
+        for picture in pictures_of(section.results):
             save_png(picture.draw(section.results), folder / picture.file)
     for drawing in DRAWINGS:
         world = world_of_label(sections[0].name, drawing.method, *drawing.setup)

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from actors.evaluation.result_table import ResultRow, read_table
-from learner.file_names import VARIANTS
+from actors.evaluation.value_table import ValueRow, read_values
+from learner.file_names import VALUES, VARIANTS
 
 
 def variants_beside(tables: Sequence[Path]) -> list[ResultRow]:
@@ -16,6 +17,15 @@ def variants_beside(tables: Sequence[Path]) -> list[ResultRow]:
       ConfigError: a table of variants cannot be read.
     """
     return [row for path in beside(tables, VARIANTS) for row in read_table(path)]
+
+
+def values_beside(tables: Sequence[Path]) -> list[ValueRow]:
+    """Rows of the tables of values beside tables of results; empty where there are none.
+
+    Raises:
+      ConfigError: a table of values cannot be read.
+    """
+    return [row for path in beside(tables, VALUES) for row in read_values(path)]
 
 
 def beside(tables: Sequence[Path], name: str) -> list[Path]:

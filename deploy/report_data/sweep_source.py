@@ -15,12 +15,12 @@ from dashboards.pages.report_page import ReportContents, TableSection
 from dashboards.plotly_charts.chart import Chart, Table
 from dashboards.plotly_charts.result_charts import failure_causes, heatmaps, transfers
 from dashboards.plotly_charts.run_charts import setup_curves, sweep_speeds
-from deploy.report_data.beside import beside, variants_beside
+from deploy.report_data.beside import beside, values_beside, variants_beside
 from deploy.report_data.episode_sources import CombinedEpisodes, EpisodeSource
 from deploy.report_data.recorded_episodes import RecordedEpisodes
 from deploy.report_data.sweep_episodes import SweepEpisodes
 from deploy.report_data.trainings import fingerprint_of, journal_rows, training_of
-from learner.file_names import CELLS, JOURNAL, RESULTS, VARIANTS
+from learner.file_names import CELLS, JOURNAL, RESULTS, VALUES, VARIANTS
 from learner.run_folder import RunFolder
 
 EPISODES_NOTE = (
@@ -54,13 +54,15 @@ class SweepSource:
 
     def fingerprint(self) -> object:
         """Changes with the table, what stands beside it, and with the tables and journals of the cells."""
-        tables = [self._table, *beside([self._table], VARIANTS), *self._cells.glob(f"*/{RESULTS}")]
-        return fingerprint_of([*tables, *self._cells.glob(f"*/{JOURNAL}")])
+        tables = [self._table, *(path for name in (VARIANTS, VALUES) for path in beside([self._table], name))]
+        return fingerprint_of(
+            [*tables, *self._cells.glob(f"*/{RESULTS}"), *self._cells.glob(f"*/{JOURNAL}")],
+        )
 
     def contents(self) -> ReportContents:
         """The report's contents as of now."""
         rows = read_table(self._table) if self._table.is_file() else []
-        presets = results_of(rows, variants_beside([self._table]))
+        presets = results_of(rows, variants_beside([self._table]), values_beside([self._table]))
         claims = {name: judge(results) for name, results in presets.items()}
         charts = [heatmaps(presets), transfers(presets), failure_causes(presets)] if presets else []
         unfinished = list(self._unfinished())

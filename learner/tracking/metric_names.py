@@ -96,7 +96,18 @@ def _evaluated() -> tuple[MetricSpec, ...]:
     last = _gauge("eval/last_arrival_steps", "eval_last_arrival_steps", "steps", meaning, "falls")
     meaning = "pairs of groups that were segregated along the way (Eq. 3.1), where several robots learn"
     segregation = _gauge("eval/segregation", "eval_segregation", "share", meaning, "near 1")
-    return (*rows, length, last, segregation)
+    return (*rows, length, last, segregation, *_values())
+
+
+def _values() -> tuple[MetricSpec, ...]:
+    of_start, of_all = "the first states of greedy episodes", "all states of greedy episodes"
+    followed, near = "mean discounted return that followed", "near what follows"
+    return (
+        _gauge("eval/q_start", "eval_q_start", "reward", f"mean value of the actions in {of_start}", near),
+        _gauge("eval/return_start", "eval_return_start", "reward", f"{followed} {of_start}", "rises"),
+        _gauge("eval/q_visited", "eval_q_visited", "reward", f"mean value of the actions in {of_all}", near),
+        _gauge("eval/return_visited", "eval_return_visited", "reward", f"{followed} {of_all}", "rises"),
+    )
 
 
 EVALUATION = _evaluated()

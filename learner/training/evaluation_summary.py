@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.evaluation.statistics import Estimate, mean, rate, rate_of_worlds
-from actors.service.messages import NO_OUTCOME, EpisodeStats
+from actors.service.messages import NO_OUTCOME, VALUE_DTYPE, EpisodeStats
 from sim_core.outcomes import ENDED, Outcome
 
 
@@ -32,14 +32,16 @@ class Evaluation(NamedTuple):
     """Summary of evaluated episodes.
 
     `rates` is empty if the environment reports no outcomes, `team` None unless several robots of a world learn. Their
-    episodes are not independent, so intervals are then those of worlds.
+    episodes are not independent, so intervals are then those of worlds. `values` has the means of VALUE_DTYPE's fields,
+    or is empty.
     """
 
     episodes: int
     rates: dict[Outcome, Estimate]
     episode_return: Estimate
     episode_length: Estimate
-    team: TeamSummary | None = None
+    team: TeamSummary | None
+    values: dict[str, float]
 
 
 def summarise(stats: EpisodeStats) -> Evaluation:
@@ -57,7 +59,13 @@ def summarise(stats: EpisodeStats) -> Evaluation:
     rates: dict[Outcome, Estimate] = {}
     if named:
         rates = {kind: rate(int((stats.outcome == kind).sum()), total) for kind in ENDED}
-    return Evaluation(total, rates, mean(stats.episode_return), mean(stats.length_steps))
+    return Evaluation(total, rates, mean(stats.episode_return), mean(stats.length_steps), None, _values(stats))
+
+
+def _values(stats: EpisodeStats) -> dict[str, float]:
+    """Means over the episodes, where they tell what the policy expected."""
+    names = (VALUE_DTYPE.names or ()) if len(stats.values) else ()
+    return {name: float(np.mean(stats.values[name])) for name in names}
 
 
 def _summarise_worlds(stats: EpisodeStats) -> Evaluation:
@@ -90,6 +98,7 @@ def _summarise_worlds(stats: EpisodeStats) -> Evaluation:
         episode_return=mean(by_world(stats.episode_return) / sizes),
         episode_length=mean(by_world(stats.length_steps) / sizes),
         team=team,
+        values=_values(stats),
     )
 
 
@@ -104,8 +113,9 @@ def outcome_label(outcome: Outcome) -> str:
 
 
 def as_metrics(evaluation: Evaluation) -> dict[str, float]:
-    """Flat metrics: mean return and length, each rate or, without outcomes, the return with its interval, teams."""
+    """Flat metrics: means, each rate or, without outcomes, the return with its interval, and those of teams."""
     metrics = {"return": evaluation.episode_return.value, "episode_length": evaluation.episode_length.value}
+    metrics |= evaluation.values
     estimates = {outcome_label(kind): estimate for kind, estimate in evaluation.rates.items()}
     if not estimates:
         estimates = {"return": evaluation.episode_return}

@@ -73,6 +73,7 @@ def test_every_gauge_is_on_the_dashboard_or_left_out_on_purpose():
     shares = ("all_arrive_rate", "learner_collision_rate")  # of teams: only where several robots of a world learn
     left_out |= {f"ray_shoal_eval_{name}{end}" for name in shares for end in ("", "_low", "_high")}
     left_out |= {"ray_shoal_eval_last_arrival_steps", "ray_shoal_eval_segregation"}
+    left_out |= {f"ray_shoal_eval_{name}_{of}" for name in ("q", "return") for of in ("start", "visited")}
     assert OURS - shown == left_out
 
 

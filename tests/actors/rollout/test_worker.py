@@ -174,8 +174,8 @@ def test_join_stats():
     one = EpisodeStats(np.array([1], np.int8), np.array([3], np.int32), np.array([0.5]))
     two = EpisodeStats(np.array([2, 5], np.int8), np.array([4, 9], np.int32), np.array([1.5, -1.0]))
     joined = join_stats([one, two])
-    assert [column.tolist() for column in joined] == [[1, 2, 5], [3, 4, 9], [0.5, 1.5, -1.0], []]
-    assert [len(column) for column in join_stats([])] == [0, 0, 0, 0]
+    assert [column.tolist() for column in joined] == [[1, 2, 5], [3, 4, 9], [0.5, 1.5, -1.0], [], []]
+    assert [len(column) for column in join_stats([])] == [0, 0, 0, 0, 0]
 
 
 def test_a_return_that_float32_does_not_hold_never_leaves_the_worker(swarm, make_worker):
