@@ -12,7 +12,7 @@ import functools
 import numpy as np
 from matplotlib.figure import Figure
 
-from actors.evaluation.evaluator import evaluate, record_episode
+from actors.evaluation.evaluator import Candidate, evaluate, record_episode
 from actors.evaluation.trajectory import Episode
 from actors.policy.baselines import Baseline
 from actors.rollout.env_spec import EnvSpec
@@ -30,17 +30,21 @@ AT_ONCE = 250
 FRAMES = 5
 
 
+def find_episode(spec: EnvSpec, player: Candidate, outcome: Outcome, first_seed: int = 0) -> Episode | None:
+    """The first of `SEARCHED` episodes of `player`, by seed, that ends in `outcome`; None if none does."""
+    for begin in range(first_seed, first_seed + SEARCHED, AT_ONCE):
+        seeds = list(range(begin, begin + AT_ONCE))
+        found = np.flatnonzero(evaluate(spec, player, seeds).outcome == outcome)
+        if len(found):
+            seed, learner = divmod(int(found[0]), spec.world.num_learners)
+            return record_episode(spec, player, seeds[seed], learner)
+    return None
+
+
 @functools.lru_cache(maxsize=32)  # reports of one preset in one process draw the same episodes
 def first_episode(world: WorldConfig, rule: Baseline, outcome: Outcome) -> Episode | None:
-    """The first of `SEARCHED` episodes of the baseline `rule` that ends in `outcome`; None if none does."""
-    spec = EnvSpec(ENV_ID, world)
-    for begin in range(0, SEARCHED, AT_ONCE):
-        seeds = list(range(begin, begin + AT_ONCE))
-        found = np.flatnonzero(evaluate(spec, rule, seeds).outcome == outcome)
-        if len(found):
-            seed, learner = divmod(int(found[0]), world.num_learners)
-            return record_episode(spec, rule, seeds[seed], learner)
-    return None
+    """The episode of `find_episode` in a world, played by a rule."""
+    return find_episode(EnvSpec(ENV_ID, world), rule, outcome)
 
 
 def draw_example(rule: Baseline, outcome: Outcome, world: WorldConfig) -> Figure:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,11 @@ from PIL import Image
 
 import dashboards
 from actors.evaluation.result_table import LEARNED, read_table
+from actors.evaluation.value_table import read_values
 from deploy.cli import main
 from deploy.runs.sweep_provenance import grid_of, read_provenance
 from learner.config import RunConfig, to_dict
-from learner.file_names import RESULTS, SETTINGS, VARIANTS
+from learner.file_names import RESULTS, SETTINGS, VALUES, VARIANTS
 from learner.sweep.grid import expected_hash, make_cell, sweep_of_label
 
 ROOT = Path(dashboards.__file__).parent / "results"
@@ -43,7 +45,7 @@ def test_the_committed_report_is_that_of_the_results(folder, tmp_path):
     assert main(["report", str(folder / "results.csv"), "--out", str(tmp_path)]) == 0
     made = {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()}
     committed = {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
-    assert made == committed - {Path(name) for name in (RESULTS, SETTINGS, VARIANTS)}
+    assert made == committed - {Path(name) for name in (RESULTS, SETTINGS, VALUES, VARIANTS)}
     for name in made:
         if name.suffix == ".md":
             assert (folder / name).read_text() == (tmp_path / name).read_text()
@@ -87,6 +89,13 @@ def test_variants_have_the_settings_of_their_labels():
         assert row.config == expected_hash(dataclasses.replace(sweep, episodes=1000, baseline_episodes=500), row)
 
 
+def test_values_are_those_of_three_trainings_of_each_algorithm():
+    (table,) = ROOT.glob(f"*/{VALUES}")
+    rows = read_values(table)
+    assert {row.preset for row in rows} == {sweep_of(table.parent).label}
+    assert {(row.algorithm, row.seed) for row in rows} == set(product(("dqn", "double_dqn"), (0, 1, 2)))
+
+
 TRIED = sorted((ROOT / "tried").glob("*.csv"))
 
 
@@ -95,5 +104,6 @@ def test_tables_of_experiments_have_the_settings_of_their_labels(table):
     rows = read_table(table)
     assert rows
     for row in rows:
-        sweep = dataclasses.replace(sweep_of_label(row.preset), episodes=600, first_seed=3_000_000_000)
+        sweep = sweep_of_label(row.preset)
+        sweep = dataclasses.replace(sweep, episodes=600, baseline_episodes=600, first_seed=3_000_000_000)
         assert row.config == expected_hash(sweep, row)
