@@ -14,6 +14,12 @@ CONDITIONS = (*SENSE_CONDITIONS, *COMMAND_CONDITIONS, "burst_steps")
 """Fields of the world that a grid sets; what no axis names has its default."""
 VARIABLE = (*CONDITIONS, "shield", "kinematics", "turn_rate_limit_deg_s", "acceleration_limit_m_s2")
 """Fields of the world that an axis may name."""
+PART_OF = {
+    "turn_rate_limit_deg_s": ("kinematics", "unicycle"),
+    "acceleration_limit_m_s2": ("kinematics", "unicycle"),
+    "burst_steps": ("burst_loss", "0.3"),
+}
+"""Fields that change nothing where another has its default; with a value of that other one."""
 DEFAULTS = {field.name: field.default for field in dataclasses.fields(WorldConfig)}
 BROKEN = 0.5
 """A player breaks where its success rate falls to this."""
@@ -80,6 +86,18 @@ def world_under(world: WorldConfig, condition: Condition) -> WorldConfig:
     """
     none = {name: DEFAULTS[name] for name in (*CONDITIONS, "conditions")}
     return dataclasses.replace(world, **{**none, **condition})
+
+
+def check_effects(axes: Sequence[Axis], worlds: Sequence[WorldConfig]) -> None:
+    """Refuses axes along which none of the grid's worlds can change.
+
+    Raises:
+      ConfigError: there is such an axis.
+    """
+    for axis in axes:
+        other, value = PART_OF.get(axis.name, (axis.name, ""))
+        has_effect = not value or any(getattr(world, other) != DEFAULTS[other] for world in worlds)
+        require(has_effect, f"{axis.name} changes nothing by itself; add --vary {other}={value}")
 
 
 def along(axis: Axis, axes: Sequence[Axis]) -> list[Condition]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.evaluation.conditions import Axis, Condition, along, world_under
+from actors.evaluation.conditions import Axis, Condition, along, check_effects, world_under
 from actors.evaluation.evaluation_store import StoredEvaluation, entry_seeds, load_evaluation, save_evaluation
 from actors.evaluation.statistics import Estimate, success_rate
 from actors.policy.policy import WeightsSnapshot
@@ -51,7 +51,7 @@ class StressResults:
       seeds: seeds of the episodes.
 
     Raises:
-      ConfigError: a condition cannot be in a player's world.
+      ConfigError: a condition cannot be in a player's world, or an axis changes nothing in any of them.
     """
 
     def __init__(
@@ -71,6 +71,7 @@ class StressResults:
             for setup in range(self._setups)
             for player, target in enumerate(targets)
         }
+        check_effects(axes, [cell.spec.world for cell in self._cells.values()])
         self._paths = {at: folder / f"{self._key(cell)}.zarr" for at, cell in self._cells.items()}
 
     def _cell(self, target: Target, setup: int, condition: Condition) -> StressCell:

@@ -139,6 +139,8 @@ def test_a_damaged_result_is_named(played, capsys):
         (["greedy", "--vary", "dropped_mates=0,99"], ["dropped_mates must be between 0 and 9"]),
         (["greedy", "--vary", "sensing_range_m=0,0.1"], ["sensing_range_m must be 0", "not 0.1"]),
         (["greedy", "--vary", "shield=wood"], ["shield must be one of: none, orca"]),
+        (["greedy", "--vary", "turn_rate_limit_deg_s=45,90"], ["add --vary kinematics=unicycle"]),
+        (["greedy", "--vary", "position_loss=0,0.5", "burst_steps=2,20"], ["add --vary burst_loss=0.3"]),
         (["greedy", "--vary", "speed=1"], ["'speed' is no condition"]),
         (["greedy", "--vary", "position_loss=0", "position_loss=1"], ["name each axis once"]),
         (["greedy", "--name", "a/b"], ["--name must be a plain folder name"]),
