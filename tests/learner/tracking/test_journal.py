@@ -123,7 +123,7 @@ def test_a_line_that_is_no_row_is_refused(tmp_path, line):
 
 def test_mlflow_gets_no_accounts_and_only_the_intervals_of_the_result():
     kept = {"final/success_rate": 0.5, "final/success_rate_low": 0.4, "final/return_high": 2.0, "eval/lost_rate": 0.1}
-    kept |= {"time/worker_waits": 0.1, "time/learner_samples": 0.2}
+    kept |= {"time/worker_waits": 0.1, "time/learner_waits": 0.2, "eval/q_visited": 0.3}
     names = "account/produced replay/size policy/staleness_s eval/success_rate_low eval/return_high final/lost_rate_low"
-    names += " time/worker_acts train/td_error"
+    names += " time/worker_acts time/learner_samples train/td_error eval/q_start"
     assert mlflow_metrics(kept | dict.fromkeys(names.split(), 1.0)) == kept
