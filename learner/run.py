@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from actors.evaluation.evaluator import evaluate_in_parallel
+from actors.evaluation.evaluator import evaluate_in_parallel, worthwhile_calls
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.env_guard import env_guard
 from actors.rollout.env_spec import EnvSpec
@@ -239,9 +239,10 @@ class RunSession:
         Raises:
           RunFailed: a task fails again and again.
         """
+        num_calls = worthwhile_calls(self._config.env, self._config.final_eval_episodes, max_calls)
 
         def play(spec: EnvSpec, weights: WeightsSnapshot) -> EpisodeStats:
-            return evaluate_in_parallel(calls, spec, calls.put(weights), final_seeds(self._config), max_calls)
+            return evaluate_in_parallel(calls, spec, calls.put(weights), final_seeds(self._config), num_calls)
 
         episodes = f"{self._config.final_eval_episodes} greedy episodes"
         self._display.message(f"training done; evaluating {episodes}")

@@ -36,6 +36,8 @@ from sim_core.worlds import WorldBatch, is_done
 
 MAX_ENVS = 250
 """Most environments stepped together."""
+ROBOT_EPISODES_PER_PROCESS = 20_000
+"""Episodes of the swarm, times the robots of each, that take as long as a process takes to start that plays them."""
 MAX_EPISODE_STEPS = 100_000
 """Longest episode of a foreign environment in an evaluation; one that never ends would keep a run from its end."""
 RGB = "rgb_array"
@@ -114,6 +116,18 @@ def _evaluate_in_turn(
     first = np.cumsum(learners) - learners  # entry of each seed, setup after setup
     places = [np.arange(first[at], first[at] + learners[at]) for at in np.argsort(order)]
     return select_stats(join_stats(played), np.concatenate(places))
+
+
+def worthwhile_calls(spec: EnvSpec, episodes: int, most: int) -> int:
+    """How many simultaneous calls of `evaluate` are worth a process each, where one runs already; at most `most`.
+
+    Args:
+      spec: the environment; how long an episode of a foreign one takes is not known, so it gets `most`.
+      episodes: to be played in each setup.
+      most: calls that can run at once.
+    """
+    robots = sum(world.num_robots for world in spec.worlds)
+    return max(1, min(most, episodes * robots // ROBOT_EPISODES_PER_PROCESS)) if spec.is_swarm else most
 
 
 def evaluate_in_parallel(

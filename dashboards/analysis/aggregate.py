@@ -19,7 +19,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri  # `scipy.stats` would take half a second to import
 
 from actors.evaluation import statistics as estimates
 from actors.evaluation.result_table import GROUPS, LEARNED, ROBOTS, ResultRow
@@ -258,7 +258,7 @@ def for_comparisons(measurement: Measurement | None, comparisons: int) -> Measur
     if measurement is None:
         return None
     value, low, high = measurement.estimate
-    wider = float(norm.ppf(1 - 0.025 / comparisons) / norm.ppf(0.975))
+    wider = float(ndtri(1 - 0.025 / comparisons) / ndtri(0.975))
     estimate = Estimate(value, value - wider * (value - low), value + wider * (high - value))
     return measurement._replace(estimate=estimate)
 

@@ -11,7 +11,7 @@ import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar, TypeVarTuple
@@ -32,6 +32,7 @@ from learner.cluster_options import DEADLINE_S, ClusterOptions
 from learner.config import RunConfig
 from learner.ray_backend.auth import TOKEN_HELP, guard_ray
 from learner.ray_backend.calls import RayCalls
+from learner.ray_backend.processes import needed_processes
 from learner.ray_backend.spares import Spares, SpareShard, SpareWorker
 from learner.ray_backend.temp_folder import own_temp_folder
 from learner.training.cluster import (
@@ -61,13 +62,15 @@ LOCAL_RAY = {
     "idle_worker_killing_time_threshold_ms": 24 * 3_600_000,
     "task_events_report_interval_ms": 0,
     "max_direct_call_object_size": 2**20,
+    "prestart_worker_first_driver": False,
 }
 """Settings of a Ray that this process starts, each against a default that costs a run time or memory.
 
 Idle worker processes are kept: an evaluation is a task beside actors that take all CPU slots, and Ray would kill its
 process after a second and start the next one from nothing. The last 100,000 calls are not recorded: that takes 300 MB,
 and only Ray's dashboard shows them. Blocks of up to 1 MiB travel in the call itself: above Ray's default of 100 KiB
-they would go through the object store, which costs several more calls."""
+they would go through the object store, which costs several more calls. Worker processes start when they are needed, not
+one for each core of the machine."""
 _own_folders: list[Path] = []
 """The folder of the Ray that this process has started, where it is not the one that Ray takes by itself."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -133,7 +136,9 @@ def connect(cpus: int, address: str | None, spare_cpus: int = 0) -> None:
     os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # from calls of nodes that have been replaced
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     options: dict[str, Any] = {"address": address, "runtime_env": {"env_vars": ONE_THREAD}}
+    starting: AbstractContextManager[None] = nullcontext()
     if address is None:
+        starting = needed_processes()
         for name, value in ONE_THREAD.items():  # a runtime_env would start processes anew that Ray has ready
             os.environ.setdefault(name, value)
         options = {
@@ -147,7 +152,7 @@ def connect(cpus: int, address: str | None, spare_cpus: int = 0) -> None:
             options["_temp_dir"] = str(own)
             _own_folders.append(own)
     try:
-        with _kept_from_children(signal.SIGHUP), _own_handler(signal.SIGTERM):
+        with starting, _kept_from_children(signal.SIGHUP), _own_handler(signal.SIGTERM):
             ray.init(logging_level="ERROR", **options)
     except (ConnectionError, AuthenticationError) as error:
         raise ConfigError(

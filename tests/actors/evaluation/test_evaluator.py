@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from actors.evaluation import evaluator
-from actors.evaluation.evaluator import evaluate, evaluate_in_parallel, record_episode, record_frames
+from actors.evaluation.evaluator import evaluate, evaluate_in_parallel, record_episode, record_frames, worthwhile_calls
 from actors.policy.baselines import PILOTS, Baseline
 from actors.policy.policy import Policy
 from actors.rollout.env_spec import EnvSpec
@@ -97,6 +97,16 @@ def test_a_parallel_evaluation_equals_the_whole_in_the_order_of_the_seeds(swarm,
     for first, second in zip(joined, whole, strict=True):
         np.testing.assert_array_equal(first, second)
     assert len(set(whole.length_steps)) > 3  # otherwise a wrong order would not show
+
+
+def test_a_process_more_is_worth_a_thousand_episodes_of_twenty_robots(swarm):
+    ten_in_two, large = swarm._replace(world=WorldConfig(robots=10, groups=2)), WorldConfig(robots=25, groups=4)
+    both = ten_in_two._replace(shares=((ten_in_two.world, 1.0), (large, 1.0)))
+    episodes = (0, 100, 1_000, 3_999, 4_000, 100_000)
+    assert [worthwhile_calls(ten_in_two, count, 16) for count in episodes] == [1, 1, 1, 3, 4, 16]
+    assert [worthwhile_calls(both, count, 16) for count in episodes] == [1, 1, 6, 16, 16, 16]
+    foreign = EnvSpec("CartPole-v1", swarm.world)
+    assert worthwhile_calls(foreign, 10, 16) == 16, "how long its episodes take is not known"
 
 
 def test_a_parallel_evaluation_of_no_seeds_is_empty(swarm):
