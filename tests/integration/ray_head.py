@@ -18,6 +18,11 @@ from tests.integration.conftest import PATIENCE_S, clean_environment, flags
 from tests.integration.jobs import kill, wait_for
 
 ROOT = Path(__file__).parents[2]
+FEW_STARTS = {
+    "RAY_idle_worker_killing_time_threshold_ms": "600000",
+    "RAY_prestart_worker_first_driver": "0",
+}
+"""Variables of nodes whose worker processes stay and start when needed, as in a Ray of our own: each takes seconds."""
 HEAD_PORTS = ("port", "dashboard-port", "ray-client-server-port")
 NODE_PORTS = (
     "dashboard-agent-listen-port",
@@ -64,7 +69,7 @@ def with_token(token: str) -> dict[str, str]:
 def ray_start(log: Path, *words: str, auth: dict[str, str], before: Sequence[str] = ()) -> subprocess.Popen:
     """`ray start --block`, with the words `before` in front of it, once it has started or ended."""
     binaries = str(Path(sys.executable).parent)
-    environment = {**clean_environment(), **auth}
+    environment = {**clean_environment(), **FEW_STARTS, **auth}
     environment["PATH"] = f"{binaries}:{environment['PATH']}"
     environment.pop("PYTHONPATH", None)  # a job's code is what was uploaded
     command = [*before, f"{binaries}/ray", "start", "--block", "--disable-usage-stats", *words]

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 from tests.integration.conftest import PATIENCE_S, clean_environment
+from tests.integration.ray_head import FEW_STARTS
 
 NODES = 3
 CPUS = 2
@@ -31,7 +32,7 @@ class SimulatedCluster:
             "RAY_TMPDIR": str(self.folder),
             "RAY_metrics_report_interval_ms": "1000",
             "RAY_USAGE_STATS_ENABLED": "0",
-            "RAY_idle_worker_killing_time_threshold_ms": "600000",  # as a Ray of our own: each start takes seconds
+            **FEW_STARTS,
         }
         self._log = self.folder / "cluster.log"
         with self._log.open("w") as log:

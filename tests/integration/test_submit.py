@@ -27,7 +27,12 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:DeprecationWarning"),  # MLflow's own query
 ]
 LONG = dataclasses.replace(
-    SMALL, env_id="CartPole-v1", engine="ray", total_env_steps=150_000, checkpoint_every_env_steps=5_000
+    SMALL,
+    env_id="CartPole-v1",
+    engine="ray",
+    total_env_steps=150_000,
+    checkpoint_every_env_steps=5_000,
+    eval_every_env_steps=50_000,
 )
 
 

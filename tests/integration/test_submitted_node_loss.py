@@ -29,6 +29,7 @@ WIDE = dataclasses.replace(
     replay_placement="actors",
     total_env_steps=60_000,
     checkpoint_every_env_steps=5_000,
+    eval_every_env_steps=20_000,
 )
 """Six parts on three nodes of two CPUs."""
 
