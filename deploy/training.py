@@ -9,6 +9,7 @@ from deploy.console.summary_tables import evaluation_table, setups_table, summar
 from deploy.console.terminal import plain_console
 from deploy.console.training_display import make_display
 from deploy.runs.checks import check_device, check_environment
+from deploy.runs.end_imports import EndImports
 from learner.checkpoints.checkpoint import Checkpoint, finished_names
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig, check_files_unchanged
@@ -102,7 +103,8 @@ def run_training(
 
                 return artifact_steps(folder, config, tracker, display.message, result, rows)
 
-            result = RunSession(folder, config, tracker, display, options, opened).execute(checkpoint, steps)
+            shown = EndImports(display, config.total_env_steps) if config.engine == "ray" else display
+            result = RunSession(folder, config, tracker, shown, options, opened).execute(checkpoint, steps)
     except Interrupted as interrupted:
         return _stopped(folder, interrupted.signal, "")
     if result.evaluation is None:
