@@ -32,7 +32,7 @@ from learner.cluster_options import DEADLINE_S, ClusterOptions
 from learner.config import RunConfig
 from learner.ray_backend.auth import TOKEN_HELP, guard_ray
 from learner.ray_backend.calls import RayCalls
-from learner.ray_backend.processes import needed_processes
+from learner.ray_backend.lean_start import lean_start
 from learner.ray_backend.spares import Spares, SpareShard, SpareWorker
 from learner.ray_backend.temp_folder import own_temp_folder
 from learner.training.cluster import (
@@ -138,7 +138,7 @@ def connect(cpus: int, address: str | None, spare_cpus: int = 0) -> None:
     options: dict[str, Any] = {"address": address, "runtime_env": {"env_vars": ONE_THREAD}}
     starting: AbstractContextManager[None] = nullcontext()
     if address is None:
-        starting = needed_processes()
+        starting = lean_start()
         for name, value in ONE_THREAD.items():  # a runtime_env would start processes anew that Ray has ready
             os.environ.setdefault(name, value)
         options = {

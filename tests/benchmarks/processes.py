@@ -8,7 +8,7 @@ import psutil
 
 from deploy.chaos.processes import TITLES
 
-SPY = "profiler"
+SPY, IDLE = "profiler", "idle worker of Ray"
 
 
 def kind_of(process: psutil.Process) -> str:
@@ -20,7 +20,7 @@ def kind_of(process: psutil.Process) -> str:
         if words[0].startswith(title):
             return kind
     if words[0].startswith("ray::IDLE"):
-        return "idle worker of Ray"
+        return IDLE
     return next((name for name in ("raylet", "gcs_server") if name in words[0]), "other process of Ray")
 
 

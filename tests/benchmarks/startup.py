@@ -23,7 +23,7 @@ from rich.table import Table
 import deploy
 from learner.file_names import CHECKPOINTS, IDENTITY, JOURNAL
 from learner.tracking.journal import read_rows
-from tests.benchmarks.processes import kind_of
+from tests.benchmarks.processes import IDLE, kind_of
 from tests.benchmarks.timing import ratio, spread
 
 ROUNDS = 3
@@ -48,14 +48,47 @@ TARGETS_S = {
     f"train in one process, cold kernels: {STORED}": 30.0,
 }
 ENDLESS = ["--total-env-steps", "100000000", "--log-every-env-steps", "1", "--checkpoint-every-env-steps", "50000"]
-POLL_S = 0.02
+POLL_S, CPU_POLL_S = 0.02, 0.2
+
+CpuSeconds = Counter[str]
+"""CPU seconds by kind of process."""
 
 
 class Training(NamedTuple):
-    """Seconds from the command to each phase, and CPU seconds by kind of process until the first stored transition."""
+    """Seconds from the command to each phase, and CPU seconds until the first stored transition and in all."""
 
     seconds: dict[str, float]
-    cpu_s: Counter[str]
+    stored_cpu_s: CpuSeconds
+    cpu_s: CpuSeconds
+
+
+class CpuMeter:
+    """CPU seconds of a command's processes, also of those that have ended.
+
+    Args:
+      driver: id of the process of the command.
+    """
+
+    def __init__(self, driver: int) -> None:
+        self._driver = psutil.Process(driver)
+        self._found: dict[psutil.Process, tuple[str, float]] = {}
+
+    def look(self) -> None:
+        """Takes in what the processes have used so far."""
+        with suppress(psutil.NoSuchProcess):
+            for process in [self._driver, *self._driver.children(recursive=True)]:
+                with suppress(psutil.NoSuchProcess):
+                    kind = "driver" if process == self._driver else kind_of(process)
+                    if kind == IDLE and process in self._found:
+                        kind, _ = self._found[process]  # what it did before it became idle
+                    self._found[process] = kind, sum(process.cpu_times()[:2])
+
+    def by_kind(self) -> CpuSeconds:
+        """CPU seconds at the last look of each process."""
+        seconds = CpuSeconds()
+        for kind, spent_s in self._found.values():
+            seconds[kind] += spent_s
+        return seconds
 
 
 def environment(checkout: Path, **more: str) -> dict[str, str]:
@@ -70,17 +103,6 @@ def seconds_of(checkout: Path, *arguments: str) -> float:
     here = {"cwd": checkout, "env": environment(checkout)}  # Python looks for modules in the present folder first
     subprocess.run(order, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **here)
     return time.perf_counter() - start_s
-
-
-def cpu_seconds(driver: psutil.Process) -> Counter[str]:
-    """CPU seconds so far of a training's processes, by kind."""
-    found: Counter[str] = Counter()
-    with suppress(psutil.NoSuchProcess):
-        found["driver"] = sum(driver.cpu_times()[:2])
-        for process in driver.children(recursive=True):
-            with suppress(psutil.NoSuchProcess):
-                found[kind_of(process)] += sum(process.cpu_times()[:2])
-    return found
 
 
 def first_row_s(run: Path) -> float | None:
@@ -106,6 +128,7 @@ def train(checkout: Path, engine: str, **more: str) -> Training:
             stderr=subprocess.STDOUT,
             text=True,
         )
+        meter = CpuMeter(child.pid)
 
         def read() -> None:
             for line in child.stdout or ():
@@ -115,7 +138,11 @@ def train(checkout: Path, engine: str, **more: str) -> Training:
         reader.start()
         while (stored_s := first_row_s(run)) is None and child.poll() is None:
             time.sleep(POLL_S)
-        cpu_s = cpu_seconds(psutil.Process(child.pid)) if child.poll() is None else Counter[str]()
+        meter.look()
+        stored_cpu_s = meter.by_kind()
+        while child.poll() is None:
+            meter.look()
+            time.sleep(CPU_POLL_S)
         reader.join()
         if child.wait() or stored_s is None:
             raise RuntimeError("".join(line for _, line in lines))
@@ -123,7 +150,11 @@ def train(checkout: Path, engine: str, **more: str) -> Training:
             next(at_s for at_s, line in lines if line.startswith(words)) for words in ("training done", "trained")
         )
         begun_s = (run / IDENTITY).stat().st_mtime
-        return Training({BEGUN: begun_s - start_s, STORED: stored_s - start_s, ENDED: summary_s - done_s}, cpu_s)
+        return Training(
+            {BEGUN: begun_s - start_s, STORED: stored_s - start_s, ENDED: summary_s - done_s},
+            stored_cpu_s,
+            meter.by_kind(),
+        )
 
 
 def recover() -> float:
@@ -166,11 +197,13 @@ class Findings:
 
     def __init__(self) -> None:
         self.seconds: dict[Path, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-        self.cpu_s: dict[Path, dict[str, list[Counter[str]]]] = defaultdict(lambda: defaultdict(list))
+        self.stored_cpu_s: dict[Path, dict[str, list[CpuSeconds]]] = defaultdict(lambda: defaultdict(list))
+        self.cpu_s: dict[Path, dict[str, list[CpuSeconds]]] = defaultdict(lambda: defaultdict(list))
 
     def add(self, checkout: Path, how: str, training: Training) -> None:
         for phase, seconds in training.seconds.items():
             self.seconds[checkout][f"train {how}: {phase}"].append(seconds)
+        self.stored_cpu_s[checkout][how].append(training.stored_cpu_s)
         self.cpu_s[checkout][how].append(training.cpu_s)
 
     def measure(self, checkout: Path) -> None:
@@ -204,22 +237,22 @@ def time_table(findings: Findings, other: Path | None) -> Table:
     return table
 
 
-def cpu_table(findings: Findings, other: Path | None) -> Table:
-    table = Table(title="CPU seconds until the first stored transition, means")
+def cpu_table(title: str, found: dict[Path, dict[str, list[CpuSeconds]]], other: Path | None) -> Table:
+    table = Table(title=f"CPU seconds {title}, means")
     table.add_column("training")
     table.add_column("process")
     for name in ("here", *(("the other",) if other else ())):
         table.add_column(name, justify="right")
     checkouts = [HERE, *([other] if other else [])]
-    for how in findings.cpu_s[HERE]:
-        means = [mean_counts(findings.cpu_s[checkout][how]) for checkout in checkouts]
+    for how in found[HERE]:
+        means = [mean_counts(found[checkout][how]) for checkout in checkouts]
         for kind in sorted(set().union(*means), key=lambda kind: -means[0].get(kind, 0.0)):
             table.add_row(how, kind, *(f"{each.get(kind, 0.0):.2f}" for each in means))
         table.add_row(how, "sum", *(f"{sum(each.values()):.2f}" for each in means), end_section=True)
     return table
 
 
-def mean_counts(counts: list[Counter[str]]) -> dict[str, float]:
+def mean_counts(counts: list[CpuSeconds]) -> dict[str, float]:
     return {kind: sum(count[kind] for count in counts) / len(counts) for kind in set().union(*counts)}
 
 
@@ -234,7 +267,8 @@ def main(against: Path | None = None, rounds: int = ROUNDS) -> None:
         findings.seconds[HERE][RECOVERED].append(recover())
     console, cold = Console(width=120), Findings()
     console.print(time_table(findings, other))
-    console.print(cpu_table(findings, other))
+    console.print(cpu_table("until the first stored transition", findings.stored_cpu_s, other))
+    console.print(cpu_table("from the command to its end", findings.cpu_s, other))
     for checkout in checkouts:
         cold.measure_cold(checkout)
     console.print(time_table(cold, other))
