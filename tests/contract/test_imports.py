@@ -43,6 +43,10 @@ PROCESSES = {
     "a rollout worker": (WORKER, MEASURED - KERNELS - {"ray", "zarr"}),
     "the learner": (LEARNER, MEASURED - KERNELS - {"torch", "ray", "zarr"}),
     "the driver": ("import deploy.training", MEASURED - KERNELS - {"mlflow", "zarr", "pandas"}),
+    "the pictures at the end of a run": (
+        "import deploy.runs.artifacts",
+        MEASURED - KERNELS - {"mlflow", "zarr", "pandas", "matplotlib"},
+    ),
     "the driver before it opens MLflow's store": (
         "import deploy.commands.train",
         MEASURED - KERNELS - {"zarr"},
