@@ -38,6 +38,8 @@ MAX_ENVS = 250
 """Most environments stepped together."""
 ROBOT_EPISODES_PER_PROCESS = 20_000
 """Episodes of the swarm, times the robots of each, that take as long as a process takes to start that plays them."""
+SHORT_PROCESSES = 4
+"""Starts of a process in the time in which a Ray of its own starts, plays and ends."""
 MAX_EPISODE_STEPS = 100_000
 """Longest episode of a foreign environment in an evaluation; one that never ends would keep a run from its end."""
 RGB = "rgb_array"
@@ -126,8 +128,18 @@ def worthwhile_calls(spec: EnvSpec, episodes: int, most: int) -> int:
       episodes: to be played in each setup.
       most: calls that can run at once.
     """
-    robots = sum(world.num_robots for world in spec.worlds)
-    return max(1, min(most, episodes * robots // ROBOT_EPISODES_PER_PROCESS)) if spec.is_swarm else most
+    return max(1, min(most, int(_processes([spec], episodes)))) if spec.is_swarm else most
+
+
+def is_short(specs: list[EnvSpec], episodes: int) -> bool:
+    """Whether one process plays so many episodes in each setup sooner than a Ray of its own would start for them."""
+    return all(spec.is_swarm for spec in specs) and _processes(specs, episodes) < SHORT_PROCESSES
+
+
+def _processes(specs: list[EnvSpec], episodes: int) -> float:
+    """How many processes start while the swarm's episodes are played, so many in each setup."""
+    robots = sum(world.num_robots for spec in specs for world in spec.worlds)
+    return episodes * robots / ROBOT_EPISODES_PER_PROCESS
 
 
 def evaluate_in_parallel(

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import shlex
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
 from actors.evaluation.statistics import Estimate, paired_comparison, success_rate
-from learner.run import RunResult
 from learner.run_folder import RunFolder
 from learner.training.evaluation_summary import Evaluation, outcome_label
 from sim_core.outcomes import Outcome
+
+if TYPE_CHECKING:  # not otherwise, since it imports MLflow, which evaluations need not wait for
+    from learner.run import RunResult
 
 
 def evaluation_table(evaluation: Evaluation, title: str, kind: str = "greedy episodes") -> Table:

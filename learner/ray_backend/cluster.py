@@ -20,7 +20,7 @@ import psutil
 import ray
 from ray.exceptions import AuthenticationError
 
-from actors.evaluation.evaluator import Candidate, evaluate_in_parallel
+from actors.evaluation.evaluator import Candidate, evaluate, evaluate_in_parallel, is_short
 from actors.replay.node import ShardNode
 from actors.rollout.env_spec import EnvSpec
 from actors.rollout.node import RolloutNode
@@ -221,9 +221,13 @@ def evaluate_in_tasks(
 ) -> list[EpisodeStats]:
     """Plays one episode per environment and seed in Ray tasks on all CPUs (see `evaluate_each` for errors).
 
+    Where no cluster is named, a few episodes of the swarm are played in this process, before a Ray would have started.
+
     Returns:
       For each environment one entry per seed, in order.
     """
+    if address is None and is_short(specs, len(seeds)):
+        return [evaluate(spec, candidate, seeds) for spec in specs]
     return list(evaluate_each([(spec, candidate) for spec in specs], seeds, address))
 
 

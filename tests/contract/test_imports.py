@@ -43,6 +43,7 @@ PROCESSES = {
     "a rollout worker": (WORKER, MEASURED - KERNELS - {"ray", "zarr"}),
     "the learner": (LEARNER, MEASURED - KERNELS - {"torch", "ray", "zarr"}),
     "the driver": ("import deploy.training", MEASURED - KERNELS - {"mlflow", "zarr", "pandas"}),
+    "an evaluation of a rule": ("import deploy.commands.evaluate", MEASURED - KERNELS - {"ray", "zarr"}),
     "the pictures at the end of a run": (
         "import deploy.runs.artifacts",
         MEASURED - KERNELS - {"mlflow", "zarr", "pandas", "matplotlib"},

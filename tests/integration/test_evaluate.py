@@ -11,7 +11,7 @@ import torch
 from safetensors.numpy import load_file
 
 from actors.evaluation.evaluation_store import load_evaluation
-from actors.evaluation.evaluator import evaluate
+from actors.evaluation.evaluator import ROBOT_EPISODES_PER_PROCESS, SHORT_PROCESSES, evaluate
 from actors.evaluation.trajectory import load_episodes
 from actors.policy.baselines import Baseline
 from actors.policy.network import QNetwork, snapshot
@@ -270,9 +270,12 @@ def test_episodes_lie_beside_the_results():
 
 @pytest.mark.ray
 def test_over_ray_the_results_are_those_of_one_process(shoal, folder):
-    done = shoal("evaluate", "random", "--robots", "4", "--episodes", "7", "--out", "e.zarr")
+    """There are enough episodes that a Ray of its own is worth its start."""
+    episodes = SHORT_PROCESSES * ROBOT_EPISODES_PER_PROCESS // 200
+    size = ["--robots", "25", "--groups", "8", "--episodes", str(episodes)]
+    done = shoal("evaluate", "random", *size, "--out", "e.zarr")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     stored = load_evaluation(folder / "e.zarr")
-    assert stored.seed.tolist() == list(range(FIRST_SEED, FIRST_SEED + 7))
+    assert stored.seed.tolist() == list(range(FIRST_SEED, FIRST_SEED + episodes))
     assert_same_stats(stored.stats, evaluate(stored.spec, Baseline.RANDOM, stored.seed.tolist()))

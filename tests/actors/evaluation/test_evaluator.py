@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from actors.evaluation import evaluator
-from actors.evaluation.evaluator import evaluate, evaluate_in_parallel, record_episode, record_frames, worthwhile_calls
+from actors.evaluation.evaluator import (
+    evaluate,
+    evaluate_in_parallel,
+    is_short,
+    record_episode,
+    record_frames,
+    worthwhile_calls,
+)
 from actors.policy.baselines import PILOTS, Baseline
 from actors.policy.policy import Policy
 from actors.rollout.env_spec import EnvSpec
@@ -107,6 +114,9 @@ def test_a_process_more_is_worth_a_thousand_episodes_of_twenty_robots(swarm):
     assert [worthwhile_calls(both, count, 16) for count in episodes] == [1, 1, 6, 16, 16, 16]
     foreign = EnvSpec("CartPole-v1", swarm.world)
     assert worthwhile_calls(foreign, 10, 16) == 16, "how long its episodes take is not known"
+    assert [is_short([ten_in_two], count) for count in (0, 3_999, 4_000)] == [True, True, False]
+    assert [is_short([both, ten_in_two], count) for count in (571, 572)] == [True, False]
+    assert not is_short([foreign], 1) and not is_short([ten_in_two, foreign], 1)
 
 
 def test_a_parallel_evaluation_of_no_seeds_is_empty(swarm):
