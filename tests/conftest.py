@@ -16,6 +16,9 @@ BUCKET = "shoal-tests"
 INDEPENDENT = ("test_faults.py", "test_peers.py", "test_process_run.py", "test_ray_run.py")
 """Integration tests that are long and share no fixture outside of a class: each may run in another process."""
 
+LONGEST = ("slow_network", "search", "submitted_node_loss", "sweep", "submit", "ray_run", "faults", "supervise")
+"""Integration tests with a Ray that take longest: none of them should be left alone at the end."""
+
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
@@ -41,9 +44,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Puts tests with a Ray at the beginning of pytest-xdist's queue, and other slow ones at its end."""
+    """Puts tests with a Ray at the start of pytest-xdist's queue, the longest first, and other slow ones at its end."""
+    ranks = {f"test_{name}": rank for rank, name in enumerate(LONGEST)}
+
+    def place(item: pytest.Item) -> tuple[bool, int, bool]:
+        rank = ranks.get(item.path.stem, len(ranks))
+        return not item.get_closest_marker("ray"), rank, bool(item.get_closest_marker("slow"))
+
     if hasattr(config, "workerinput"):
-        items.sort(key=lambda item: (not item.get_closest_marker("ray"), bool(item.get_closest_marker("slow"))))
+        items.sort(key=place)
 
 
 @pytest.fixture(scope="session")

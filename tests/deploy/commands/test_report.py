@@ -129,7 +129,7 @@ def test_a_policy_in_two_tables_counts_once_and_is_refused_if_they_differ(tmp_pa
 def test_settings_that_do_not_fit_the_diagrams_leave_the_report_complete(
     changed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(report, "PICTURES", ())  # they show results, not settings
+    monkeypatch.setattr(report, "pictures_of", lambda results: ())  # they show results, not settings
     rows = [line._replace(preset=f"thesis+{changed}") for line in claimed_table()[:3]]
     assert set(made(rows, tmp_path)) == COMMON
 
