@@ -21,6 +21,8 @@ from tests.benchmarks.contest import Finding, Heat
 ROOT = Path(__file__).parents[2]
 OURS = "shoal"
 LIMIT = "the limit"
+TWO_WORKERS = "2 workers"
+"""A style of ours: rollout workers beside the learner; where simulating is what takes time, one is too few."""
 
 
 class Contest(NamedTuple):
@@ -57,7 +59,8 @@ class Contender(NamedTuple):
 
     def styles(self, contest: Contest) -> list[Style]:
         if self.module in ("shoal", "limit"):
-            return [Style(envs, 1) for envs in (16, 64, 128)]
+            kinds = ("", TWO_WORKERS) if self.module == "shoal" else ("",)
+            return [Style(envs, 1, kind) for kind in kinds for envs in (16, 64, 128)]
         if self.module == "sb3":
             kinds = ("", "vectorised") if contest.config.env.is_swarm else ("",)
             return [Style(envs, threads, kind) for kind in kinds for envs in (8, 64, 256) for threads in (1, 2)]

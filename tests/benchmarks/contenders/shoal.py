@@ -4,12 +4,14 @@ import dataclasses
 
 from actors.policy.policy import WeightsSnapshot
 from tests.benchmarks.contest import Finding, Heat, Lap, compete
+from tests.benchmarks.entrants import TWO_WORKERS
 from tests.benchmarks.ray_service import ray_service
 from tests.checkpointing import Silent
 
 
 def train(heat: Heat) -> Finding:
-    config = dataclasses.replace(heat.config, envs_per_worker=heat.envs, eval_every_env_steps=10**9)
+    workers = 2 if heat.variant == TWO_WORKERS else 1
+    config = dataclasses.replace(heat.config, workers=workers, envs_per_worker=heat.envs, eval_every_env_steps=10**9)
     with ray_service(config) as make_loop:
 
         def weights() -> WeightsSnapshot:
