@@ -195,8 +195,9 @@ class SearchDriver:
             if known:
                 tracker.resume(known)
             else:
-                params = {name: str(value) for name, value in self._settings[number].items()}
-                tracker.start_trial(self._place.trial_name(number), params, tags)
+                tracker.start_trial(self._place.trial_name(number), tags)
+            params = {name: str(value) for name, value in self._settings[number].items()}
+            tracker.log_params(params)  # of a known run, too: a kill may have come before it had them
             self._trackers[number] = tracker
         return self._trackers[number]
 

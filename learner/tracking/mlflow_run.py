@@ -163,11 +163,14 @@ class Tracker:
         self.run_id, self.started_ms = run.info.run_id, run.info.start_time
         self.log_inputs(config)
 
-    def start_trial(self, name: str, params: dict[str, str], tags: dict[str, str]) -> None:
-        """Creates a run of a search's trial, with the settings that it varies as params."""
+    def start_trial(self, name: str, tags: dict[str, str]) -> None:
+        """Creates a run of a search's trial."""
         given = {"mlflow.runName": name, "mlflow.source.git.commit": self._commit} | tags
         run = self._client.create_run(self._experiment_id, tags=given)
         self.run_id, self.started_ms = run.info.run_id, run.info.start_time
+
+    def log_params(self, params: dict[str, str]) -> None:
+        """Logs the settings that a search's trial varies; harmless to repeat."""
         self._client.log_batch(self.run_id, params=[Param(key, value) for key, value in params.items()])
 
     def log_inputs(self, config: RunConfig) -> None:

@@ -60,6 +60,18 @@ def runs_of(place):
     return {int(run.data.tags["trial"]): run for run in client.search_runs([experiment])}
 
 
+def test_a_run_that_a_kill_left_without_its_settings_gets_them(place):
+    search = search_of("arena_radius_m=3.0..6.0", budget="1")
+    client = mlflow.MlflowClient(place.tracking_uri)
+    experiment = client.get_experiment_by_name(place.experiment).experiment_id
+    client.create_run(experiment, tags={"search": place.folder.name, "trial": "0"})
+    driver, _, _ = open_driver(search, place)
+    number, settings = driver.next()
+    play(driver, search, place, number, settings)
+    (run,) = runs_of(place).values()
+    assert run.data.params == {name: str(value) for name, value in settings.items()} and run.info.status == "FINISHED"
+
+
 def test_a_trial_that_was_run_but_not_told_is_told_by_the_next_session(place):
     search = search_of("arena_radius_m=3.0..6.0", budget="2")
     driver, _, _ = open_driver(search, place)
