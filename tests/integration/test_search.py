@@ -23,7 +23,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:DeprecationWarning"),  # MLflow's own query
 ]
 
-TRIALS = 8
+TRIALS = 6
 SPACE = ["arena_radius_m=3.0..8.0", "time_step_s=0.02..0.05"]
 PLAYED = ["--policy", "greedy", "--robots", "5", "10", "--episodes", "400", "--objective", "success", "worst"]
 COMMAND = ["search", "--space", *SPACE, *PLAYED, "--budget", str(TRIALS), "--name", "s", "--at-once", "2"]

@@ -25,7 +25,7 @@ SWEEP = SweepConfig(
     robots=(5,),
     groups=(1, 2),
     seeds=(0,),
-    env_steps=30_000,
+    env_steps=24_000,
     episodes=20,
     extrapolation_episodes=5,
     baselines=("greedy",),
@@ -33,7 +33,7 @@ SWEEP = SweepConfig(
 )
 GRID = "--methods sensor in --robots 5 --groups 1 2 --seeds 0 --episodes 20 --extrapolation-episodes 5".split()
 GRID += "--baselines greedy --baseline-episodes 10".split()
-COMMAND = ["sweep", *GRID, "--env-steps", "30000", "--name", "s"]
+COMMAND = ["sweep", *GRID, "--env-steps", "24000", "--name", "s"]
 
 
 @pytest.fixture(scope="module")
