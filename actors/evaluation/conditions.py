@@ -95,9 +95,10 @@ def check_effects(axes: Sequence[Axis], worlds: Sequence[WorldConfig]) -> None:
       ConfigError: there is such an axis.
     """
     for axis in axes:
-        other, value = PART_OF.get(axis.name, (axis.name, ""))
-        has_effect = not value or any(getattr(world, other) != DEFAULTS[other] for world in worlds)
-        require(has_effect, f"{axis.name} changes nothing by itself; add --vary {other}={value}")
+        if axis.name in PART_OF:
+            other, value = PART_OF[axis.name]
+            has_effect = any(getattr(world, other) != DEFAULTS[other] for world in worlds)
+            require(has_effect, f"{axis.name} changes nothing by itself; add --vary {other}={value}")
 
 
 def along(axis: Axis, axes: Sequence[Axis]) -> list[Condition]:

@@ -23,7 +23,6 @@ from actors.evaluation.statistics import Estimate, mean
 from actors.policy.baselines import Baseline, exists
 from actors.rollout.env_spec import EnvSpec
 from actors.service.messages import EpisodeStats
-from deploy.cli import main as shoal
 from deploy.runs.policy_lookup import find_policy
 from learner.presets import preset_config
 from learner.run_folder import RunFolder
@@ -32,6 +31,7 @@ from sim_core import ENV_ID
 from sim_core.config import WorldConfig
 from sim_core.outcomes import ENDED, OUTCOME_NAMES, Outcome
 from sim_core.plugins import DISSERTATION_METHODS
+from tests.benchmarks.trainings import trained
 
 UNSEEN = ((7, 3), (12, 5), (30, 2), (3, 6))
 """Robots per group and groups that no training plays."""
@@ -68,19 +68,13 @@ class Played(NamedTuple):
         return float(np.isin(self.stats.outcome, outcomes).mean())
 
 
-def trained(method: str, seed: int, runs_dir: Path, settings: list[str]) -> RunFolder:
-    """The run of a training, which is made unless it is there."""
-    folder = RunFolder(runs_dir / f"{method}-{seed}")
-    arguments = ["--preset", "generalist", "--method", method, "--seed", str(seed), *settings]
-    place = ["--runs-dir", str(runs_dir), "--name", folder.path.name, "--or-resume", "True"]
-    if shoal(["train", *arguments, *place]):
-        raise SystemExit(f"the training {folder.path} has not come to its end")
-    return folder
-
-
 def results(method: str, options: argparse.Namespace) -> Iterator[list[Played]]:
     """What the players did, setup after setup; the rules first."""
-    folders = [trained(method, seed, options.runs_dir, options.train) for seed in options.seeds]
+    settings = ["--preset", "generalist", "--method", method]
+    folders = [
+        trained(options.runs_dir, f"{method}-{seed}", [*settings, "--seed", str(seed), *options.train])
+        for seed in options.seeds
+    ]
     base = folders[0].config()
     unseen = [dataclasses.replace(base.world, robots=robots, groups=groups) for robots, groups in UNSEEN]
     worlds = [*base.env.worlds, *unseen]

@@ -15,36 +15,23 @@ from rich.console import Console
 from rich.table import Table
 
 from actors.evaluation.value_table import ValueRow, write_values
+from actors.service.messages import VALUE_DTYPE
 from dashboards.analysis.overestimation import late, overestimation
-from deploy.cli import main as shoal
 from learner.run_folder import RunFolder
 from learner.tracking.journal import read_rows
+from tests.benchmarks.trainings import trained
 
 RUNS = Path("runs/overestimation")
 ALGORITHMS = ("dqn", "double_dqn")
-VALUES = ("q_start", "return_start", "q_visited", "return_visited")
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.overestimation", description=__doc__)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of the trainings")
-    parser.add_argument(
-        "--runs-dir", type=Path, default=Path("runs/overestimation"), help="finished trainings are kept"
-    )
-    parser.add_argument("--out", type=Path, default=Path("runs/overestimation/values.csv"), help="the table")
+    parser.add_argument("--runs-dir", type=Path, default=RUNS, help="finished trainings are kept")
+    parser.add_argument("--out", type=Path, default=RUNS / "values.csv", help="the table")
     parser.add_argument("train", nargs="*", help="after --: settings of the trainings, as of `shoal train`")
     return parser.parse_args(arguments)
-
-
-def trained(algorithm: str, seed: int, options: argparse.Namespace) -> RunFolder:
-    """The run of a training, which is made unless it is there."""
-    folder = RunFolder(options.runs_dir / f"{algorithm}-{seed}")
-    settings = ["--preset", "thesis", "--algorithm", algorithm, "--seed", str(seed), "--engine", "process"]
-    settings += ["--eval-every-env-steps", "50000", "--final-eval-episodes", "100", *options.train]
-    place = ["--runs-dir", str(options.runs_dir), "--name", folder.path.name, "--or-resume", "True"]
-    if shoal(["train", *settings, *place]):
-        raise SystemExit(f"the training {folder.path} has not come to its end")
-    return folder
 
 
 def rows_of(folder: RunFolder) -> Iterator[ValueRow]:
@@ -54,7 +41,7 @@ def rows_of(folder: RunFolder) -> Iterator[ValueRow]:
     training = ("thesis", world.method_name, world.robots, world.groups, config.algorithm, config.seed)
     for row in read_rows(folder.journal):
         if "eval/q_visited" in row.metrics:
-            values = [round(row.metrics[f"eval/{name}"], 4) for name in VALUES]
+            values = [round(row.metrics[f"eval/{name}"], 4) for name in VALUE_DTYPE.names]
             yield ValueRow(*training, row.env_steps, total, config.eval_episodes, *values)
 
 
@@ -67,7 +54,9 @@ def table(rows: list[ValueRow]) -> Table:
         measured = overestimation(rows, algorithm)
         assert measured is not None
         value, low, high = measured.estimate
-        values, returns = ([getattr(row, name) for row in late(rows, algorithm)] for name in VALUES[2:])
+        values, returns = (
+            [getattr(row, name) for row in late(rows, algorithm)] for name in ("q_visited", "return_visited")
+        )
         means = f"{np.mean(values):.3f}", f"{np.mean(returns):.3f}"
         found.add_row(algorithm, *means, f"{value:+.3f} ({low:+.3f} … {high:+.3f})")
     return found
@@ -75,7 +64,13 @@ def table(rows: list[ValueRow]) -> Table:
 
 def main(arguments: list[str] | None = None) -> int:
     options = parse(arguments)
-    folders = [trained(algorithm, seed, options) for seed in options.seeds for algorithm in ALGORITHMS]
+    settings = ["--preset", "thesis", "--engine", "process", "--eval-every-env-steps", "50000"]
+    settings += ["--final-eval-episodes", "100", *options.train]
+    folders = [
+        trained(options.runs_dir, f"{algorithm}-{seed}", ["--algorithm", algorithm, "--seed", str(seed), *settings])
+        for seed in options.seeds
+        for algorithm in ALGORITHMS
+    ]
     rows = [row for folder in folders for row in rows_of(folder)]
     write_values(options.out, rows)
     Console(width=120).print(table(rows))

@@ -16,10 +16,9 @@ from dashboards.figures.example_episodes import FRAMES, find_episode
 from dashboards.figures.film_strip import episode_strip
 from dashboards.figures.style import save_png
 from dashboards.figures.video import episode_frames, write_mp4
-from deploy.cli import main as shoal
 from deploy.runs.policy_lookup import find_policy
-from learner.run_folder import RunFolder
 from sim_core.outcomes import OUTCOME_NAMES, Outcome
+from tests.benchmarks.trainings import trained
 
 NAME = "figure-3-2"
 SIZE_PX = 300
@@ -28,20 +27,13 @@ FASTER = 2
 """How much faster than simulated time the films play."""
 
 
-def trained(runs_dir: Path) -> RunFolder:
-    """The run of the training, which is made unless it is there."""
-    setup = ["--preset", "thesis", "--robots", "10", "--groups", "8", "--engine", "process"]
-    if shoal(["train", *setup, "--runs-dir", str(runs_dir), "--name", NAME, "--or-resume", "True"]):
-        raise SystemExit("the training has not come to its end")
-    return RunFolder(runs_dir / NAME)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="folder of the figure and the films")
     parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
     arguments = parser.parse_args()
-    run = trained(arguments.runs_dir)
+    setup = ["--preset", "thesis", "--robots", "10", "--groups", "8", "--engine", "process"]
+    run = trained(arguments.runs_dir, NAME, setup)
     config = run.config()
     world, weights = config.world, find_policy(run, config)
     for outcome in (Outcome.GOAL, Outcome.CAPTURED):

@@ -13,33 +13,10 @@ import pytest
 
 from deploy.cli import main
 from learner.config import RunConfig
-from sim_core.config import WorldConfig
+from tests.small_run import SMALL
 
 PATIENCE_S = 600.0
 """Longer than anything takes on a busy machine, and less than pytest's timeout, so that a failure shows its log."""
-SMALL_WORLD = WorldConfig(robots=3, groups=2, horizon_steps=60)
-SMALL = RunConfig(
-    world=SMALL_WORLD,
-    engine="process",
-    total_env_steps=6_000,
-    envs_per_worker=8,
-    steps_per_block=16,
-    min_replay=512,
-    replay_capacity=4_000,
-    samples_per_insert=4.0,
-    batch_size=32,
-    updates_per_call=4,
-    hidden_sizes=(16,),
-    n_step=2,
-    target_update_interval=20,
-    epsilon_decay_env_steps=2_000,
-    learning_rate_decay_env_steps=5_000,
-    eval_every_env_steps=2_000,
-    eval_episodes=6,
-    final_eval_episodes=8,
-    log_every_env_steps=1_000,
-    checkpoint_every_env_steps=2_000,
-)
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import signal
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,10 @@ from safetensors.numpy import load_file
 
 from deploy.cli import main
 from learner.checkpoints.checkpoint import newest_valid
-from learner.loop import TrainingLoop
-from learner.tracking.journal import Journal
-from learner.training.cluster import ProcessCluster
 from tests.checkpointing import Silent
 from tests.integration.conftest import PATIENCE_S, flags
 from tests.integration.jobs import Job
+from tests.small_run import OPTIONS, train
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:The ``noload`` loader strategy:DeprecationWarning"
@@ -27,35 +24,12 @@ CLOCKED = ("speed/", "system/", "time/", "policy/staleness_s")
 """Metrics that depend on the clock."""
 
 
-OPTIONS = {
-    "replay": "prioritised",
-    "importance_exponent_env_steps": 5_000,
-    "network": "dueling",
-    "loss": "mse",
-    "target_update": "soft",
-    "learning_rate_schedule": "cosine",
-    "random_turns": True,
-    "teacher": "greedy",
-}
-
-
 class Listing(Silent):
     def __init__(self):
         self.steps = []
 
     def checkpoint(self, folder, journal_offset):
         self.steps.append(int(folder.name.removeprefix("step-")))
-
-
-def train(config, folder: Path, observer=None) -> None:
-    """Trains to the end, from the newest checkpoint in the folder if there is one."""
-    saved = newest_valid(folder / "checkpoints")[0] if (folder / "checkpoints").exists() else None
-    cluster = ProcessCluster(config, saved.state["incarnation"] + 1 if saved else 0)
-    with closing(Journal(folder / "metrics.jsonl", saved.state["journal_offset"] if saved else 0)) as journal:
-        loop = TrainingLoop(config, cluster, journal, folder / "checkpoints", observer or Silent(), bool)
-        if saved:
-            loop.restore(saved)
-        assert loop.run()
 
 
 def final_state(folder: Path):
