@@ -71,7 +71,8 @@ def contests() -> dict[str, Contest]:
     cartpole = from_dict(tomllib.loads((ROOT / "deploy/configs/cartpole.toml").read_text("utf-8")))
     often = {"eval_every_env_steps": 10_000, "eval_episodes": 200, "checkpoint_every_env_steps": 10**9}
     seldom = {"total_env_steps": 10**8, "eval_every_env_steps": 10**9, "checkpoint_every_env_steps": 10**9}
-    swarm = RunConfig(world=WorldConfig(decision_interval_steps=4))  # as the preset `best` decides
+    # decisions and blocks as in the preset `best`: a block of 128 decisions of 4 steps each would come late
+    swarm = RunConfig(world=WorldConfig(decision_interval_steps=4), steps_per_block=32, updates_per_call=32)
     wide = RunConfig(world=WorldConfig(method="in", robots=5, groups=8))
     return {
         "cartpole": Contest(
