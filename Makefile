@@ -11,7 +11,7 @@ INSTALL := $(PIP) --constraint .ci/constraints.txt --editable
 # Python compiles the modules that it imports, once. pip would compile all, which takes longer than a first training saves.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: train test lint style types kernels constraints bench bench-peers bench-robots bench-exactness reproduce generalist shares overestimation fuzz soak setup clean
+.PHONY: train test lint style types kernels constraints bench bench-peers bench-robots bench-exactness reproduce generalist shares robustness overestimation fuzz soak setup clean
 
 setup: $(READY)
 
@@ -101,6 +101,11 @@ generalist: $(READY)
 # ARGS="--methods sensor --setups 10x2 --seeds 0" for some.
 shares: $(READY)
 	$(BIN)/python -m tests.benchmarks.shares $(ARGS)
+
+# Policies trained for bad senses beside ones trained without, and the rules: 27 trainings of two minutes, then 17 conditions
+# in three setups. ARGS="--methods sensor --seeds 0" for some.
+robustness: $(READY)
+	$(BIN)/python -m tests.benchmarks.robustness $(ARGS)
 
 # What DQN and Double DQN expect beside what they get: six trainings, a table for `shoal report`. ARGS="--seeds 0" for two.
 overestimation: $(READY)

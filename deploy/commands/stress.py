@@ -43,7 +43,7 @@ def run(command: Stress) -> int:
     seeds = list(range(command.first_seed, command.first_seed + command.episodes))
     results = StressResults(folder, targets, axes, conditions, seeds)
     make_folder(folder, "the folder of results,")
-    _play_missing(results, seeds, ray_address(command.address))
+    play_missing(results, seeds, ray_address(command.address))
     console = plain_console()
     console.print(_table(results, targets, conditions))
     console.print(_breaks(results, targets, axes))
@@ -73,7 +73,8 @@ def _log(target: Target, written: Sequence[Path], place: str) -> None:
         plain_console(stderr=True).print(f"not logged to MLflow for {target.name}: {error}", soft_wrap=True)
 
 
-def _play_missing(results: StressResults, seeds: list[int], address: str | None) -> None:
+def play_missing(results: StressResults, seeds: list[int], address: str | None) -> None:
+    """Plays and stores the cells that are not there yet, in Ray tasks (see `evaluate_each`)."""
     missing, console = results.missing(), plain_console()
     if not missing:
         return

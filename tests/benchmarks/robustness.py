@@ -1,0 +1,197 @@
+"""`make robustness`: policies trained for bad senses beside policies trained without, and beside the rules.
+
+For every method, trainings of the preset `generalist` in three setups with several seeds: `clean`; `drawn`, with
+conditions drawn for every episode (domain randomisation); and `drawn, history`, which also sees what it sensed before.
+All policies and rules then meet the same start scenes under each condition by itself. Differences are paired: an
+episode's mean over the trainings, less that of `clean` without any condition. A player breaks where its success falls
+to 50 %.
+"""
+
+import argparse
+import csv
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from actors.evaluation.conditions import Axis, breaking_point, grid, parse_axis
+from actors.evaluation.statistics import Estimate, mean
+from actors.policy.baselines import Baseline, exists
+from dashboards.figures.stress_curves import Panel, stress_curves_png
+from deploy.options.results import Stress
+from deploy.playing.players import find_players
+from deploy.playing.stress_results import StressResults
+from sim_core.plugins import DISSERTATION_METHODS
+from tests.benchmarks.trainings import trained
+
+SETUPS = ("5x2", "10x4", "25x4")
+ENV_STEPS = 600_000
+CLEAN = "clean"
+DRAWN = (
+    *("--conditions", "drawn", "--position-loss", "0.9", "--position-noise-m", "0.3"),
+    *("--position-delay-steps", "10", "--dropped-mates", "2"),
+)
+KINDS = {CLEAN: (), "drawn": DRAWN, "drawn, history": (*DRAWN, "--history", "4")}
+"""Settings that the trainings differ in."""
+AXES = tuple(
+    parse_axis(text)
+    for text in (
+        "position_loss=0,0.25,0.5,0.75,0.9",
+        "position_noise_m=0,0.1,0.2,0.3,0.5",
+        "position_delay_steps=0,2,5,10",
+        "dropped_mates=0,1,2,3,4",
+    )
+)
+SHOWN = (("position_loss", 0.0), ("position_loss", 0.5), ("position_noise_m", 0.3), ("position_delay_steps", 10)) + (
+    ("dropped_mates", 2),
+)
+"""Conditions of the printed table; the CSV file and the figure have all."""
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.robustness", description=__doc__)
+    parser.add_argument("--methods", nargs="+", choices=DISSERTATION_METHODS, default=list(DISSERTATION_METHODS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of the trainings")
+    parser.add_argument("--episodes", type=int, default=300, help="per player, setup and condition")
+    parser.add_argument("--first-seed", type=int, default=2_000_000_000, help="of the episodes")
+    parser.add_argument(
+        "--runs-dir", type=Path, default=Path("runs/robustness"), help="what is trained, played and found"
+    )
+    parser.add_argument("train", nargs="*", help="after --: settings of the trainings, as of `shoal train`")
+    return parser.parse_args(arguments)
+
+
+def run_name(method: str, kind: str, seed: int) -> str:
+    return f"{method}-{kind.replace(', ', '-')}-{seed}"
+
+
+def train(method: str, options: argparse.Namespace) -> list[str]:
+    """Names of all trainings, which are made unless they are there, and of the rules."""
+    steps = str(ENV_STEPS)
+    common = ["--preset", "generalist", "--method", method, "--engine", "process", "--setups", *SETUPS]
+    common += ["--total-env-steps", steps, "--learning-rate-decay-env-steps", steps]
+    common += ["--eval-every-env-steps", steps, "--checkpoint-every-env-steps", steps]
+    names = []
+    for seed in options.seeds:
+        for kind, settings in KINDS.items():
+            names.append(run_name(method, kind, seed))
+            folder = trained(options.runs_dir, names[-1], [*common, "--seed", str(seed), *settings, *options.train])
+    world = folder.config().world
+    return [*names, *(str(rule) for rule in (Baseline.GREEDY, Baseline.FIELD, Baseline.FL_ORCA) if exists(rule, world))]
+
+
+class Curve(NamedTuple):
+    """A player's successes along an axis in one setup, the mean over its trainings: `[values, episodes]`."""
+
+    axis: Axis
+    setup: str
+    player: str
+    goals: NDArray[np.float64]
+
+    @property
+    def rates(self) -> list[Estimate]:
+        return [Estimate(*np.clip(mean(goals), 0.0, 1.0)) for goals in self.goals]
+
+
+def curves(method: str, names: list[str], options: argparse.Namespace) -> Iterator[Curve]:
+    """What was played under each condition by itself, played first where it is missing."""
+    from deploy.commands.stress import play_missing  # imports Ray, which `shoal train` configures first
+
+    players = {kind: [names.index(run_name(method, kind, seed)) for seed in options.seeds] for kind in KINDS} | {
+        name: [names.index(name)] for name in names if name in list(Baseline)
+    }
+    seeds = list(range(options.first_seed, options.first_seed + options.episodes))
+    for axis in AXES:
+        targets = find_players(Stress(run=tuple(names), runs_dir=options.runs_dir))
+        folder = options.runs_dir / "played"
+        results = StressResults(folder, targets, [axis], grid([axis]), seeds)
+        play_missing(results, seeds, None)
+        for setup, name in enumerate(results.setups()):
+            for player, members in players.items():
+                goals = [
+                    np.mean([results.goals(member, setup, value)[:, 0] for member in members], axis=0)
+                    for value in range(len(axis.values))
+                ]
+                yield Curve(axis, name, player, np.array(goals))
+
+
+def table(method: str, found: list[Curve], options: argparse.Namespace) -> Table:
+    """Success under the conditions shown, and the paired difference to the clean policy without a condition."""
+    clean = {curve.setup: curve.goals[0] for curve in found if curve.player == CLEAN}
+    players = list(dict.fromkeys(curve.player for curve in found))
+    title = f"{method}: success in %, paired difference to {CLEAN} without conditions"
+    result = Table(title=f"{title}; {len(options.seeds)} trainings, {options.episodes} episodes")
+    for name in ("setup", "condition", *players):
+        result.add_column(name, justify="left" if name in ("setup", "condition") else "right")
+    for setup in clean:
+        for number, (axis, value) in enumerate(SHOWN):
+            at = {curve.player: curve for curve in found if (curve.axis.name, curve.setup) == (axis, setup)}
+            row = at[CLEAN].axis.values.index(value)
+            texts = []
+            for player in players:
+                goals = at[player].goals[row]
+                difference, low, high = (100 * share for share in mean(goals - clean[setup]))
+                texts.append(f"{100 * goals.mean():.1f}: {difference:+.1f} ({low:+.1f} … {high:+.1f})")
+            result.add_row("" if number else setup, f"{axis} {value}" if value else "none", *texts)
+        result.add_section()
+    return result
+
+
+def breaks(method: str, found: list[Curve]) -> Table:
+    """Where the mean over a player's trainings falls to 50 % along each axis."""
+    players = list(dict.fromkeys(curve.player for curve in found))
+    result = Table(title=f"{method}: where success falls to 50 %")
+    for name in ("setup", "condition", *players):
+        result.add_column(name, justify="left" if name in ("setup", "condition") else "right")
+    for setup in dict.fromkeys(curve.setup for curve in found):
+        for axis in AXES:
+            points = [
+                breaking_point(axis.values, [rate.value for rate in curve.rates])
+                for curve in found
+                if (curve.axis, curve.setup) == (axis, setup)
+            ]
+            result.add_row(setup, axis.name, *("–" if point is None else f"{point:.3g}" for point in points))
+        result.add_section()
+    return result
+
+
+def write(path: Path, method: str, found: list[Curve]) -> None:
+    """Writes every point as CSV: the success rate with its interval, in shares."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["method", "setup", "condition", "value", "player", "episodes", "success", "low", "high"])
+        for curve in found:
+            for value, goals, rate in zip(curve.axis.values, curve.goals, curve.rates, strict=True):
+                numbers = (f"{share:.4f}" for share in rate)
+                writer.writerow([method, curve.setup, curve.axis.name, value, curve.player, len(goals), *numbers])
+
+
+def main(arguments: list[str] | None = None) -> int:
+    options, console = parse(arguments), Console(width=190)
+    for method in options.methods:
+        found = list(curves(method, train(method, options), options))
+        console.print(table(method, found, options))
+        console.print(breaks(method, found))
+        path = options.runs_dir / method
+        write(path.with_suffix(".csv"), method, found)
+        panels = [
+            Panel(
+                f"{axis.name}, {setup}",
+                axis.values,
+                {c.player: c.rates for c in found if (c.axis, c.setup) == (axis, setup)},
+            )
+            for axis in AXES
+            for setup in dict.fromkeys(curve.setup for curve in found)
+        ]
+        stress_curves_png(panels, path.with_suffix(".png"), f"{method}: success under bad senses")
+        print(path.with_suffix(".csv"), path.with_suffix(".png"))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
