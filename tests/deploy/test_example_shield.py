@@ -9,9 +9,9 @@ import pytest
 import deploy
 from deploy.commands.export import shield_numbers
 from sim_core.config import WorldConfig
+from tests.sim_core.half_planes import half_planes, least_violation, violation
 from tests.sim_core.orca_scenes import GENERIC_KINDS, numbered_scene
-from tests.sim_core.test_orca_programs import least_violation, violation
-from tests.sim_core.test_shield import config_of, half_planes, shielded
+from tests.sim_core.test_shield import CLEARANCE, config_of, shielded
 
 EXAMPLE = runpy.run_path(str(Path(deploy.__file__).parent / "examples" / "shield.py"))
 
@@ -30,7 +30,7 @@ def test_it_drives_what_the_simulators_shield_lets_drive(knows):
                 found = EXAMPLE["shielded"](pref[robot], vel[robot], pos[others] - pos[robot], vel[others], numbers)
                 tried += 1
                 differ += np.abs(found - expected[robot]).max() > 2e-3
-                if knows == "no" and len(lines := half_planes(scene, robot)):
+                if knows == "no" and len(lines := half_planes(scene.pos, scene.vel, robot, CLEARANCE)):
                     least = least_violation(lines, 1.0)
                     infeasible += least > 0
                     assert violation(lines, found) < max(least, 0.0) + 1e-6

@@ -1,16 +1,11 @@
-"""ORCA's linear programs against an enumeration of all candidate points and scipy's SLSQP, in float64.
-
-A half-plane is (point, unit direction d); its violation at v is det(d, point - v) = offset - n . v with
-the inward normal n = (-d_y, d_x).
-"""
-
-import itertools
+"""ORCA's linear programs against an enumeration of all candidate points and scipy's SLSQP, in float64."""
 
 import numpy as np
 import pytest
 from scipy import optimize
 
 from sim_core.orca import orca_params
+from tests.sim_core.half_planes import closest_permitted, least_violation, normals_and_offsets, violation
 from tests.sim_core.kernels import second_program, third_program
 
 LIMIT = 1.3
@@ -24,63 +19,6 @@ def random_lines(rng, count, spread):
     if count > 2 and rng.random() < 0.3:
         angle[1] = angle[0] + np.pi * rng.integers(2)
     return np.column_stack([rng.normal(0, spread, (count, 2)), np.cos(angle), np.sin(angle)])
-
-
-def normals_and_offsets(lines):
-    """Inward unit normals `[count, 2]` and offsets `[count]`: violation = offset - normal . v."""
-    normal = np.column_stack([-lines[:, 3], lines[:, 2]])
-    return normal, np.einsum("ij,ij->i", normal, lines[:, :2])
-
-
-def violation(lines, v):
-    """The largest violation `[...]` of the velocities v `[..., 2]`."""
-    normal, offset = normals_and_offsets(lines)
-    return (offset - np.asarray(v) @ normal.T).max(axis=-1)
-
-
-def on_circle(normal, offset, limit):
-    """The points of the circle |v| = limit with normal . v = offset; the normal may have any length."""
-    length = np.linalg.norm(normal)
-    if length < 1e-12 or abs(offset) > limit * length:
-        return []
-    foot, along = normal * offset / length**2, np.array([-normal[1], normal[0]]) / length
-    half = np.sqrt(max(limit**2 - foot @ foot, 0.0))
-    return [foot + half * along, foot - half * along]
-
-
-def closest_permitted(lines, limit, opt):
-    """The permitted velocity closest to `opt`, or None: the best of all points where the optimum can lie."""
-    normal, offset = normals_and_offsets(lines)
-    length = np.linalg.norm(opt)
-    points = [opt if length <= limit else opt / length * limit]
-    for i in range(len(lines)):
-        points.append(opt + (offset[i] - normal[i] @ opt) * normal[i])
-        points += on_circle(normal[i], offset[i], limit)
-    for i, j in itertools.combinations(range(len(lines)), 2):
-        pair = normal[[i, j]]
-        if abs(np.linalg.det(pair)) > 1e-12:
-            points.append(np.linalg.solve(pair, offset[[i, j]]))
-    points = np.array(points)
-    permitted = (violation(lines, points) < 1e-9) & (np.linalg.norm(points, axis=1) < limit + 1e-9)
-    if not permitted.any():
-        return None
-    return min(points[permitted], key=lambda v: np.linalg.norm(v - opt))
-
-
-def least_violation(lines, limit):
-    """The minimum over the disc of the largest violation: the best of all points where the optimum can lie."""
-    normal, offset = normals_and_offsets(lines)
-    points = list(limit * normal)
-    for i, j in itertools.combinations(range(len(lines)), 2):
-        points += on_circle(normal[i] - normal[j], offset[i] - offset[j], limit)
-        points.append(0.5 * (lines[i, :2] + lines[j, :2]))  # needed for antiparallel pairs
-    for triple in itertools.combinations(range(len(lines)), 3):
-        system = np.column_stack([normal[list(triple)], np.ones(3)])
-        if abs(np.linalg.det(system)) > 1e-12:
-            points.append(np.linalg.solve(system, offset[list(triple)])[:2])
-    points = np.array(points)
-    inside = np.linalg.norm(points, axis=1) <= limit + 1e-9
-    return violation(lines, points[inside]).min()
 
 
 def solve(lines, opt, direction_opt=False):

@@ -15,11 +15,12 @@ from sim_core.pilot import Pilot
 from sim_core.shield import SPEED_MARGIN, Shield
 from sim_core.state import empty_state
 from sim_core.worlds import WorldBatch
+from tests.sim_core.half_planes import Clearance, closest_permitted, half_planes, least_violation, violation
 from tests.sim_core.orca_scenes import GENERIC_KINDS, KINDS, numbered_scene
 from tests.sim_core.parity import BOUND_M_S, compare, total
-from tests.sim_core.test_orca_programs import closest_permitted, least_violation, violation
 
 RADIUS_M, HORIZON_S, RANGE_M = 0.12, 0.5, 1.5
+CLEARANCE = Clearance(RADIUS_M, HORIZON_S, RANGE_M)
 
 
 def config_of(num_robots, **fields):
@@ -55,32 +56,6 @@ def test_with_half_of_the_avoidance_it_gives_rvo2s_velocity(kind):
     assert found.infeasible > 0 or kind not in GENERIC_KINDS
 
 
-def half_planes(scene, robot):
-    """The half-planes `[count, 4]` float64 of a robot that takes all of the avoidance, by geometry (Fig. 1 and 3)."""
-    pos, vel = scene.pos.astype(float), scene.vel.astype(float)
-    lines, radius = [], 2 * RADIUS_M
-    for other in range(len(pos)):
-        p, v = pos[other] - pos[robot], vel[robot] - vel[other]
-        distance = np.linalg.norm(p)
-        if other == robot or distance >= RANGE_M:
-            continue
-        tau = HORIZON_S if distance > radius else 0.05
-        disc, disc_radius = p / tau, radius / tau
-        away = v - disc
-        nearest = disc + away / np.linalg.norm(away) * disc_radius  # on the cut-off circle
-        outward = away / np.linalg.norm(away)
-        leg = np.arccos(np.clip(disc @ (disc - nearest) / np.linalg.norm(disc) / disc_radius, -1, 1))
-        if distance > radius and leg > np.arccos(radius / distance):  # the nearest point is on a leg
-            side = 1 if p[0] * away[1] - p[1] * away[0] > 0 else -1
-            angle = side * np.arcsin(radius / distance)
-            cos, sin = np.cos(angle), np.sin(angle)
-            along = np.array([cos * p[0] - sin * p[1], sin * p[0] + cos * p[1]]) / distance
-            nearest, outward = (v @ along) * along, side * np.array([-along[1], along[0]])
-        point = vel[robot] + (nearest - v)
-        lines.append([*point, outward[1], -outward[0]])
-    return np.array(lines).reshape(-1, 4)
-
-
 def test_with_all_of_the_avoidance_it_gives_the_nearest_permitted_or_the_least_bad_velocity():
     feasible = infeasible = changed = 0
     for kind in GENERIC_KINDS:
@@ -88,7 +63,7 @@ def test_with_all_of_the_avoidance_it_gives_the_nearest_permitted_or_the_least_b
             scene = numbered_scene(kind, number, 9)
             own = shielded(scene, swarm_knows_learner="no").astype(float)
             for robot in range(9):
-                lines = half_planes(scene, robot)
+                lines = half_planes(scene.pos, scene.vel, robot, CLEARANCE)
                 if not len(lines):
                     continue
                 best = closest_permitted(lines, SPEED_MARGIN, scene.pref[robot].astype(float))
