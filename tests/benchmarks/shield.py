@@ -1,7 +1,7 @@
 """The shield in the worlds of preset `best`, 25 setups: success, and collisions per million robot steps.
 
-A collision in spite of the shield is played again. Its robot was squeezed if the half-planes of the robots that it sensed
-one simulator step before permitted no velocity; if they did, the robot that it hit left the velocity that it had.
+A collision in spite of the shield is played again. Its robot was squeezed if the half-planes of the robots that it had
+sensed one simulator step before permitted no velocity; if they did, the robot that it hit has left its velocity.
 
 python -m tests.benchmarks.shield --methods in out --episodes 1000     # 100,000 episodes of the rule `greedy`
 """
