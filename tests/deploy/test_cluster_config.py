@@ -10,8 +10,9 @@ import pytest
 from ray.autoscaler._private.util import prepare_config, validate_config
 from ray.scripts.scripts import start as ray_start
 
+from learner.ray_backend.cluster import LOCAL_RAY
 from tests.deploy.manifests import ROOT, read_yaml, with_misspelt
-from tests.deploy.project import image_ray_version
+from tests.deploy.project import CONTAINERFILE, image_ray_version
 
 (CONFIG,) = read_yaml(ROOT / "deploy" / "ray-cluster.yml")
 
@@ -56,6 +57,14 @@ def test_ray_start_knows_every_flag_and_requires_the_token(name):
     assert found and "RAY_AUTH_MODE=token" in command
     ray_start.make_context("start", shlex.split(arguments))  # click refuses unknown flags
     assert "--metrics-export-port=8080" in arguments
+
+
+@pytest.mark.parametrize("name", ["head_start_ray_commands", "worker_start_ray_commands"])
+def test_nodes_have_the_images_settings_of_ray(name):
+    settings = re.findall(r"RAY_([a-z_]+)=(\d+)", CONTAINERFILE.read_text("utf-8"))
+    assert len(settings) == 2
+    assert settings == re.findall(r"RAY_([a-z_]+)=(\d+)", " ".join(CONFIG[name]))
+    assert {setting for setting, _ in settings} <= set(LOCAL_RAY), "names that Ray is known to take"
 
 
 def test_workers_join_the_heads_port():
