@@ -3,12 +3,13 @@
 LLVM does not vectorise the branchy loops of ORCA by itself. The extension type `LanesType(element)` makes the vectors
 explicit: it is LLVM's `<8 x element>`, which LLVM lowers to the vector registers of the processor.
 
-Kernels read like scalar code. `+ - * /`, comparisons and `& | ~` work lane by lane; a scalar operand is broadcast to
-all lanes. `select` replaces `if`, and `any_lane` tells whether any lane needs a branch. Elements are float32, float64,
-int32 or, in masks, bool. Division and square root are IEEE 754's, so each lane gives the bits that scalar code would
-give. Comparisons are ordered: with NaN every comparison is false, `!=` included.
+Kernels read like scalar code. `+ - * /`, comparisons and `& | ^ ~ >>` work lane by lane; a scalar operand is broadcast
+to all lanes. `select` replaces `if`, and `any_lane` tells whether any lane needs a branch. Elements are float32,
+float64, whole numbers or, in masks, bool. Division and square root are IEEE 754's, so each lane gives the bits that
+scalar code would give. Comparisons are ordered: with NaN every comparison is false, `!=` included.
 
-Arrays are indexed flat: vector i of an array consists of its elements 8 i to 8 i + 7.
+Arrays are indexed flat: vector i of an array consists of its elements 8 i to 8 i + 7. `load_some` and `store_some` take
+any elements in a row, of which there may be fewer than eight.
 """
 
 from __future__ import annotations
@@ -69,8 +70,16 @@ def _common_element(*arguments: Any) -> Any:
     return elements.pop()
 
 
-def _binary(operation: Any, emit: Callable[[Any, bool, Any, Any], Any], compares: bool) -> None:
-    """Defines a binary operator on vectors. `emit(builder, is_float, a, b)` emits its LLVM instruction."""
+def _is_float(element: Any) -> bool:
+    return isinstance(element, types.Float)
+
+
+def _is_signed(element: Any) -> bool:
+    return bool(isinstance(element, types.Integer) and element.signed)
+
+
+def _binary(operation: Any, emit: Callable[[Any, Any, Any, Any], Any], compares: bool) -> None:
+    """Defines a binary operator on vectors. `emit(builder, element, a, b)` emits its LLVM instruction."""
 
     @type_callable(operation)
     def typed(context: Any) -> Any:
@@ -85,25 +94,33 @@ def _binary(operation: Any, emit: Callable[[Any, bool, Any, Any], Any], compares
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         element = _common_element(*sig.args)
         a, b = (_broadcast(context, builder, v, t, element) for v, t in zip(args, sig.args, strict=True))
-        return emit(builder, isinstance(element, types.Float), a, b)
+        return emit(builder, element, a, b)
 
     for left, right in ((LanesType, LanesType), (LanesType, types.Number), (types.Number, LanesType)):
         lower_builtin(operation, left, right)(lower)
 
 
-def _compare(symbol: str) -> Callable[[Any, bool, Any, Any], Any]:
-    def emit(builder: Any, is_float: bool, a: Any, b: Any) -> Any:
-        return builder.fcmp_ordered(symbol, a, b) if is_float else builder.icmp_signed(symbol, a, b)
+def _compare(symbol: str) -> Callable[[Any, Any, Any, Any], Any]:
+    def emit(builder: Any, element: Any, a: Any, b: Any) -> Any:
+        if _is_float(element):
+            return builder.fcmp_ordered(symbol, a, b)
+        return (builder.icmp_signed if _is_signed(element) else builder.icmp_unsigned)(symbol, a, b)
 
     return emit
 
 
-_binary(operator.add, lambda builder, is_float, a, b: (builder.fadd if is_float else builder.add)(a, b), False)
-_binary(operator.sub, lambda builder, is_float, a, b: (builder.fsub if is_float else builder.sub)(a, b), False)
-_binary(operator.mul, lambda builder, is_float, a, b: (builder.fmul if is_float else builder.mul)(a, b), False)
+def _shift_right(builder: Any, element: Any, a: Any, b: Any) -> Any:
+    return (builder.ashr if _is_signed(element) else builder.lshr)(a, b)
+
+
+_binary(operator.add, lambda builder, element, a, b: (builder.fadd if _is_float(element) else builder.add)(a, b), False)
+_binary(operator.sub, lambda builder, element, a, b: (builder.fsub if _is_float(element) else builder.sub)(a, b), False)
+_binary(operator.mul, lambda builder, element, a, b: (builder.fmul if _is_float(element) else builder.mul)(a, b), False)
 _binary(operator.truediv, lambda builder, _, a, b: builder.fdiv(a, b), False)
 _binary(operator.and_, lambda builder, _, a, b: builder.and_(a, b), False)
 _binary(operator.or_, lambda builder, _, a, b: builder.or_(a, b), False)
+_binary(operator.xor, lambda builder, _, a, b: builder.xor(a, b), False)
+_binary(operator.rshift, _shift_right, False)
 for _operation, _symbol in (
     (operator.lt, "<"),
     (operator.le, "<="),
@@ -169,6 +186,60 @@ def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
         return builder.select(args[0], *pair)
 
     return result(mask, a, b), lower
+
+
+@intrinsic
+def lane_numbers(typingctx: Any) -> Any:
+    """The int32 numbers of the lanes, 0 to 7."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return ir.Constant(ir.VectorType(ir.IntType(32), LANES), list(range(LANES)))
+
+    return LanesType(types.int32)(), lower
+
+
+def _conversion(source: Any, target: Any) -> str:
+    """The LLVM instruction, by its builder's name, that makes numbers of type `target` from those of type `source`."""
+    if _is_float(source) and _is_float(target):
+        return "fpext" if target.bitwidth > source.bitwidth else "fptrunc"
+    if _is_float(target):
+        return "sitofp" if _is_signed(source) else "uitofp"
+    if target.bitwidth < source.bitwidth:
+        return "trunc"
+    return "sext" if _is_signed(source) else "zext"
+
+
+@intrinsic
+def convert(typingctx: Any, vector: Any, dtype: Any) -> Any:
+    """A vector of whole numbers or reals as one of `dtype`; of reals as one of reals.
+
+    Reals are rounded to the nearest; of whole numbers that do not fit, the low bits stay.
+    """
+    source, target = vector.element, dtype.instance_type
+    if _is_float(source) and not _is_float(target):
+        return None  # no kernel needs it, and how to round would have to be said
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        if source.bitwidth == target.bitwidth and _is_float(source) == _is_float(target):
+            return args[0]
+        return getattr(builder, _conversion(source, target))(
+            args[0], ir.VectorType(context.get_data_type(target), LANES)
+        )
+
+    return LanesType(target)(vector, dtype), lower
+
+
+@intrinsic
+def view_bits(typingctx: Any, vector: Any, dtype: Any) -> Any:
+    """The same bits of every lane, read as numbers of `dtype`, which has as many."""
+    target = dtype.instance_type
+    if target.bitwidth != vector.element.bitwidth:
+        return None
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], ir.VectorType(context.get_data_type(target), LANES))
+
+    return LanesType(target)(vector, dtype), lower
 
 
 def _select_ordered(builder: Any, symbol: str, a: Any, b: Any) -> Any:
@@ -248,6 +319,54 @@ def store(typingctx: Any, array: Any, i: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, i, value), lower
+
+
+def _first_lanes(context: Any, builder: Any, count: Any, count_type: Any) -> Any:
+    """A mask that is set in the first `count` lanes."""
+    number = ir.Constant(ir.VectorType(ir.IntType(32), LANES), list(range(LANES)))
+    return builder.icmp_signed("<", number, _splat(builder, context.cast(builder, count, count_type, types.int32)))
+
+
+def _masked(builder: Any, name: str, result: Any, arguments: list[Any]) -> Any:
+    """Calls the LLVM intrinsic `llvm.masked.<name>` for vectors; `arguments` as it takes them."""
+    function_type = ir.FunctionType(result, [argument.type for argument in arguments])
+    vector = result if name == "load" else arguments[0].type
+    suffix = {"float": "f32", "double": "f64"}.get(str(vector.element), str(vector.element))
+    full_name = f"llvm.masked.{name}.v{LANES}{suffix}.p0"
+    return builder.call(cgutils.get_or_insert_function(builder.module, function_type, full_name), arguments)
+
+
+@intrinsic
+def load_some(typingctx: Any, array: Any, first: Any, count: Any) -> Any:
+    """Elements `first` to `first + count - 1` of a C-contiguous array, at most eight, in the first lanes; else 0."""
+    if array.layout != "C":
+        return None
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        start = context.cast(builder, args[1], sig.args[1], types.intp)
+        pointer, align = _vector_pointer(context, builder, sig.args[0], args[0], start, LANES)
+        vector = ir.VectorType(context.get_data_type(sig.args[0].dtype), LANES)
+        lanes = _first_lanes(context, builder, args[2], sig.args[2])
+        arguments = [pointer, ir.Constant(ir.IntType(32), align), lanes, ir.Constant(vector, None)]
+        return _masked(builder, "load", vector, arguments)
+
+    return LanesType(array.dtype)(array, first, count), lower
+
+
+@intrinsic
+def store_some(typingctx: Any, array: Any, first: Any, count: Any, value: Any) -> Any:
+    """Writes the first `count` lanes to elements `first` to `first + count - 1` of a C-contiguous array."""
+    if array.layout != "C":
+        return None
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        start = context.cast(builder, args[1], sig.args[1], types.intp)
+        pointer, align = _vector_pointer(context, builder, sig.args[0], args[0], start, LANES)
+        lanes = _first_lanes(context, builder, args[2], sig.args[2])
+        _masked(builder, "store", ir.VoidType(), [args[3], pointer, ir.Constant(ir.IntType(32), align), lanes])
+        return context.get_dummy_value()
+
+    return types.void(array, first, count, value), lower
 
 
 def _lane_indices(builder: Any, vector: Any) -> list[Any]:

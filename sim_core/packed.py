@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -24,4 +25,10 @@ def packed(params: Any) -> NDArray[Any]:
 
     Fields may be numbers, arrays and named tuples of these. A kernel takes the array and reads its only element.
     """
-    return np.array([_values(params)], _dtype(params))
+    return np.array([_values(params)], _shared(_dtype(params)))
+
+
+@functools.cache
+def _shared(dtype: Any) -> Any:
+    """The first of all equal dtypes: numba knows the type of an array by the identity of its dtype."""
+    return dtype

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_core.jit import inlined, kernel
+from sim_core.lanes import LANES, convert, lane_numbers, load_some, select, sqrt, store_some, view_bits
 
 _GOLDEN_GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -20,9 +21,9 @@ _MIX_2 = np.uint64(0x94D049BB133111EB)
 _SHIFT_30, _SHIFT_27, _SHIFT_31, _SHIFT_11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
 _TO_UNIT = 1.0 / 9007199254740992.0
 _SHIFT_32, _LOW_32 = np.uint64(32), np.uint64(0xFFFFFFFF)
-_ONE, _TWO, _HALF, _QUARTER, _TO_UNIT_32 = map(np.float32, (1.0, 2.0, 0.5, 0.25, 2.0**-32))
+_ZERO, _ONE, _TWO, _HALF, _QUARTER, _TO_UNIT_32 = map(np.float32, (0.0, 1.0, 2.0, 0.5, 0.25, 2.0**-32))
 _LN_2, _THIRD, _FIFTH, _SEVENTH = map(np.float32, (math.log(2.0), 1 / 3, 1 / 5, 1 / 7))
-_SQRT_HALF_BITS, _MANTISSA_BITS = np.int32(0x3F3504F3), np.int32(23)
+_SQRT_HALF_BITS, _MANTISSA_BITS, _EXPONENT_ONE = np.int32(0x3F3504F3), np.int32(23), np.int32(2**23)
 _SINE = [(-1.0) ** k * (2.0 * math.pi) ** (2 * k + 1) / math.factorial(2 * k + 1) for k in range(6)]
 _S0, _S1, _S2, _S3, _S4, _S5 = map(np.float32, _SINE)
 
@@ -43,14 +44,30 @@ def uniform_at(state, draw):
 
 
 @inlined
+def lanes_at(state, draw, stride):
+    """Draws `draw`, `draw` + `stride` and so on, one a lane, as `bits_at` gives them: a vector of uint64."""
+    first, step = state + np.uint64(draw) * _GOLDEN_GAMMA, np.uint64(stride) * _GOLDEN_GAMMA
+    z = convert(lane_numbers(), np.uint64) * step + first
+    z = (z ^ (z >> _SHIFT_30)) * _MIX_1
+    z = (z ^ (z >> _SHIFT_27)) * _MIX_2
+    return z ^ (z >> _SHIFT_31)
+
+
+@inlined
+def uniforms_at(state, draw, stride):
+    """The draws of `lanes_at` as `uniform_at` gives them: a vector of float64 in [0, 1)."""
+    return convert(lanes_at(state, draw, stride) >> _SHIFT_11, np.float64) * _TO_UNIT
+
+
+@inlined
 def _log(u):
     """Ln u of a float32 in (0, 1]: u = m 2^e with m in [sqrt(1/2), sqrt(2)), and ln m = 2 artanh((m - 1) / (m + 1))."""
-    bits = np.float32(u).view(np.int32)
-    e = np.int32(np.int32(bits - _SQRT_HALF_BITS) >> _MANTISSA_BITS)
-    m = np.int32(bits - np.int32(e << _MANTISSA_BITS)).view(np.float32)
+    bits = view_bits(u, np.int32)
+    e = (bits - _SQRT_HALF_BITS) >> _MANTISSA_BITS
+    m = view_bits(bits - e * _EXPONENT_ONE, np.float32)
     s = (m - _ONE) / (m + _ONE)
     z = s * s
-    return np.float32(e) * _LN_2 + _TWO * s * (_ONE + z * (_THIRD + z * (_FIFTH + z * _SEVENTH)))
+    return convert(e, np.float32) * _LN_2 + _TWO * s * (_ONE + z * (_THIRD + z * (_FIFTH + z * _SEVENTH)))
 
 
 @inlined
@@ -61,22 +78,30 @@ def _sine(turns):
 
 
 @inlined
+def _normal_pairs(bits, scale):
+    """Box and Muller's two normal numbers (x, y) of the draws `bits` (see `add_normal`)."""
+    u = (convert(convert(bits >> _SHIFT_32, np.uint32), np.float32) + _HALF) * _TO_UNIT_32
+    turns = convert(view_bits(convert(bits, np.uint32), np.int32), np.float32) * _TO_UNIT_32
+    radius = scale * sqrt(-_TWO * _log(u))
+    ahead = _QUARTER - abs(turns)
+    aside = _QUARTER - abs(ahead)
+    return radius * _sine(ahead), radius * _sine(select(turns < _ZERO, -aside, aside))
+
+
+@inlined
 def add_normal(state, draw, stride, scale, out_x, out_y):
     """Adds normal noise of standard deviation `scale` to points (out_x, out_y) `[count]`, all of them float32.
 
     Point i takes draw `draw` + `stride` i after `state`: its high 32 bits, as a float32 in (0, 1], give the radius, its
     low ones, as a signed number of turns, the direction (Box and Muller 1958). So the largest radius is 6.7. Logarithm
-    and sine are series of plain operations: the loop has no branch and no call, compilers turn it into vector code, and
-    every machine computes the same numbers.
+    and sine are series of plain operations: vectors compute them without a branch or call, and every machine the same
+    numbers.
     """
-    for i in range(out_x.shape[0]):
-        bits = bits_at(state, draw + stride * i)
-        u = (np.float32(np.uint32(bits >> _SHIFT_32)) + _HALF) * _TO_UNIT_32
-        turns = np.float32(np.int32(np.uint32(bits & _LOW_32))) * _TO_UNIT_32
-        radius = scale * np.float32(math.sqrt(-_TWO * _log(u)))
-        ahead = _QUARTER - abs(turns)
-        out_x[i] += radius * _sine(ahead)
-        out_y[i] += radius * _sine(math.copysign(_QUARTER - abs(ahead), turns))
+    for i in range(0, out_x.shape[0], LANES):
+        count = out_x.shape[0] - i
+        x, y = _normal_pairs(lanes_at(state, draw + stride * i, stride), scale)
+        store_some(out_x, i, count, load_some(out_x, i, count) + x)
+        store_some(out_y, i, count, load_some(out_y, i, count) + y)
 
 
 @kernel

@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from sim_core.config import WorldConfig
 from sim_core.jit import for_types_of, inlined, kernel
+from sim_core.lanes import LANES, any_lane, convert, extract_lane, load_some, select, splat, sqrt, store_some
 from sim_core.packed import packed
-from sim_core.rng import add_normal, bits_at, uniform_at
+from sim_core.rng import add_normal, bits_at, uniform_at, uniforms_at
 from sim_core.state import WorldState
 
 NOISE, LOSS, BURST, DELAY, DROPPED, RANGE, VIEW, MIX_UP, COMMAND_DELAY, SPEED, HEADING = range(11)
@@ -40,7 +41,7 @@ IS_DROPPED, IN_BURST = np.uint8(1), np.uint8(2)
 POS_X, POS_Y, VEL_X, VEL_Y = range(4)
 """Rows of what is known of robots."""
 _PASSED = ("pos_x", "pos_y", "vel_x", "vel_y")
-_NAN = np.float32(np.nan)
+_NAN, _NO_BITS = np.float32(np.nan), np.uint8(0)
 
 
 class SenseParams(NamedTuple):
@@ -54,8 +55,6 @@ class SenseParams(NamedTuple):
     group_begin: NDArray[np.int32]
     drawn: bool
     leave_burst: float
-    ring: int
-    command_ring: int
 
 
 class Truth(NamedTuple):
@@ -110,8 +109,6 @@ def sense_params(config: WorldConfig, state: WorldState) -> SenseParams:
         group_begin=state.group_begin,
         drawn=config.conditions == "drawn",
         leave_burst=1.0 / config.burst_steps,
-        ring=config.position_delay_steps + 1,
-        command_ring=config.command_delay_steps + 1,
     )
 
 
@@ -201,24 +198,47 @@ def _remember(world, truth, past):
 
 
 @inlined
-def _report(world, step, truth, memory, p):
-    """Writes the positions and velocities that are reported in this step: the true ones, or older ones."""
-    if p.ring == 1:
-        _copy(truth.pos_x[world], memory.known[POS_X, world])
-        _copy(truth.pos_y[world], memory.known[POS_Y, world])
-        _copy(truth.vel_x[world], memory.known[VEL_X, world])
-        _copy(truth.vel_y[world], memory.known[VEL_Y, world])
-        return
-    _remember(world, truth, memory.past[world, step % p.ring])
-    past = memory.past[world, (step + p.ring - int(memory.conditions[world, DELAY])) % p.ring]
-    for row in range(4):
-        _copy(past[row], memory.known[row, world])
+def _places(step, ring, delay):
+    """Places in a ring of the last steps: that of `step`, and that of `delay` steps before, which is shorter."""
+    now = step % ring
+    then = now - int(delay)
+    return now, then + ring if then < 0 else then
 
 
 @inlined
-def _hide(world, robot, memory):
-    for row in range(4):
-        memory.known[row, world, robot] = _NAN
+def _load_rows(array, first, size, count):
+    """Elements from `first` on of four rows of `size` elements, as vectors; `_store_rows` writes such."""
+    return (
+        load_some(array, first, count),
+        load_some(array, first + size, count),
+        load_some(array, first + 2 * size, count),
+        load_some(array, first + 3 * size, count),
+    )
+
+
+@inlined
+def _store_rows(array, first, size, count, x, y, vx, vy):
+    store_some(array, first, count, x)
+    store_some(array, first + size, count, y)
+    store_some(array, first + 2 * size, count, vx)
+    store_some(array, first + 3 * size, count, vy)
+
+
+@inlined
+def _reported(world, i, now, then, truth, memory):
+    """What is reported of robots i to i + 7 in this step, vectors (x, y, vx, vy): the truth, or that of an older step.
+
+    Places `now` and `then` of the ring are this step's and the one of which it is told.
+    """
+    num_robots, ring = truth.pos_x.shape[1], memory.past.shape[1]
+    count, at = num_robots - i, world * num_robots + i
+    x, y = load_some(truth.pos_x, at, count), load_some(truth.pos_y, at, count)
+    vx, vy = load_some(truth.vel_x, at, count), load_some(truth.vel_y, at, count)
+    if ring == 1:
+        return x, y, vx, vy
+    begin, size = world * ring, 4 * num_robots
+    _store_rows(memory.past, (begin + now) * size + i, num_robots, count, x, y, vx, vy)
+    return _load_rows(memory.past, (begin + then) * size + i, num_robots, count)
 
 
 @inlined
@@ -235,33 +255,52 @@ def _facing(world, truth, p):
 
 
 @inlined
-def _hide_unseen(world, truth, memory, p):
-    """Hides the robots that are out of the learning robot's range or view."""
-    learner = truth.learner[world]
-    x, y = truth.pos_x[world, learner], truth.pos_y[world, learner]
-    facing_x, facing_y = _facing(world, truth, p)
-    range_m, least_cos = memory.conditions[world, RANGE], memory.conditions[world, VIEW]
-    for robot in range(truth.pos_x.shape[1]):
-        dx, dy = memory.known[POS_X, world, robot] - x, memory.known[POS_Y, world, robot] - y
-        distance_m = math.sqrt(dx * dx + dy * dy)
-        if distance_m > range_m or dx * facing_x + dy * facing_y < least_cos * distance_m:
-            _hide(world, robot, memory)
+def _out_of_sight(x, y, own_x, own_y, facing_x, facing_y, conditions):
+    """Which of the robots at vectors (x, y) are out of the learning robot's range or view."""
+    dx, dy = x - own_x, y - own_y
+    distance_m = convert(sqrt(dx * dx + dy * dy), np.float64)
+    ahead_m = convert(dx, np.float64) * facing_x + convert(dy, np.float64) * facing_y
+    return (distance_m > conditions[RANGE]) | (ahead_m < conditions[VIEW] * distance_m)
 
 
 @inlined
-def _hide_lost(world, draw, memory, p):
-    """Moves every robot's channel by a step; hides the robots that are dropped, in a burst, or lost by themselves."""
+def _lost(world, i, draw, memory, p):
+    """Which of robots i to i + 7 are dropped, in a burst, or lost by themselves; moves their channels by a step."""
     stream, loss, share = memory.stream[world], memory.conditions[world, LOSS], memory.conditions[world, BURST]
+    num_robots, at = memory.channel.shape[1], draw + DRAWS * i
+    count, first = num_robots - i, world * num_robots + i
+    bits = load_some(memory.channel, first, count)
     if share > 0.0:
-        enter_burst = p.leave_burst * share / (1.0 - share)
-        for robot in range(memory.channel.shape[1]):
-            bits = memory.channel[world, robot]
-            chance = uniform_at(stream, draw + DRAWS * robot + 2)
-            in_burst = chance >= p.leave_burst if bits & IN_BURST else chance < enter_burst
-            memory.channel[world, robot] = bits & IS_DROPPED | (IN_BURST if in_burst else np.uint8(0))
-    for robot in range(memory.channel.shape[1]):
-        if memory.channel[world, robot] or uniform_at(stream, draw + DRAWS * robot + 1) < loss:
-            _hide(world, robot, memory)
+        chance, dropped, was_in_burst = uniforms_at(stream, at + 2, DRAWS), bits & IS_DROPPED, bits >= IN_BURST
+        enters = chance < p.leave_burst * share / (1.0 - share)
+        stays = ~(chance < p.leave_burst)
+        bits = select((was_in_burst & stays) | (~was_in_burst & enters), dropped | IN_BURST, dropped)
+        store_some(memory.channel, first, count, bits)
+    return (bits != _NO_BITS) | (uniforms_at(stream, at + 1, DRAWS) < loss)
+
+
+@inlined
+def _know(world, truth, memory, p):
+    """Writes what is reported of the robots that are sensed, NaN for the others."""
+    conditions, learner, step = memory.conditions[world], truth.learner[world], truth.steps[world]
+    now, then = _places(step, memory.past.shape[1], conditions[DELAY])
+    own_x, own_y = truth.pos_x[world, learner], truth.pos_y[world, learner]
+    has_horizon = conditions[RANGE] < np.inf or conditions[VIEW] > -2.0
+    facing_x, facing_y = _facing(world, truth, p) if conditions[VIEW] > -2.0 else (0.0, 0.0)
+    loses = conditions[LOSS] > 0.0 or conditions[BURST] > 0.0 or conditions[DROPPED] > 0.0
+    num_robots = truth.pos_x.shape[1]
+    draw = _first_draw(step, num_robots)
+    for i in range(0, num_robots, LANES):
+        x, y, vx, vy = _reported(world, i, now, then, truth, memory)
+        hidden = splat(False)
+        if has_horizon:
+            hidden = _out_of_sight(x, y, own_x, own_y, facing_x, facing_y, conditions)
+        if loses:
+            hidden = hidden | _lost(world, i, draw, memory, p)
+        x, y = select(hidden, _NAN, x), select(hidden, _NAN, y)
+        vx, vy = select(hidden, _NAN, vx), select(hidden, _NAN, vy)
+        first, size = world * num_robots + i, truth.pos_x.size
+        _store_rows(memory.known, first, size, num_robots - i, x, y, vx, vy)
 
 
 @inlined
@@ -287,41 +326,51 @@ def _another(robot, chance, learner, p):
 
 
 @inlined
-def _mix_up(world, learner, draw, memory, p):
+def _mix_up(world, truth, memory, p):
     """Exchanges robots with robots of other groups, one after the other."""
-    stream, chance = memory.stream[world], memory.conditions[world, MIX_UP]
-    for robot in range(memory.channel.shape[1]):
-        at = draw + DRAWS * robot
-        if robot == learner or not uniform_at(stream, at + 4) < chance:
+    stream, chance, learner = memory.stream[world], memory.conditions[world, MIX_UP], truth.learner[world]
+    num_robots = memory.channel.shape[1]
+    draw = _first_draw(truth.steps[world], num_robots)
+    for first in range(0, num_robots, LANES):
+        drawn = uniforms_at(stream, draw + DRAWS * first + 4, DRAWS)
+        if not any_lane(drawn < chance):
             continue
-        other = _another(robot, uniform_at(stream, at + 5), learner, p)
-        if other >= 0:
-            for row in range(4):
-                known = memory.known[row, world]
-                known[robot], known[other] = known[other], known[robot]
+        for robot in range(first, min(first + LANES, num_robots)):
+            if robot == learner or not extract_lane(drawn, robot - first) < chance:
+                continue
+            other = _another(robot, uniform_at(stream, draw + DRAWS * robot + 5), learner, p)
+            if other >= 0:
+                for row in range(4):
+                    known = memory.known[row, world]
+                    known[robot], known[other] = known[other], known[robot]
+
+
+@inlined
+def _know_itself(world, truth, memory):
+    """Writes the learning robot's own position and velocity, which it always knows."""
+    learner, known = truth.learner[world], memory.known
+    known[POS_X, world, learner] = truth.pos_x[world, learner]
+    known[POS_Y, world, learner] = truth.pos_y[world, learner]
+    known[VEL_X, world, learner] = truth.vel_x[world, learner]
+    known[VEL_Y, world, learner] = truth.vel_y[world, learner]
 
 
 @kernel
 def _sense(truth, mask, memory, params):
     p = params[0]
-    num_robots = truth.pos_x.shape[1]
+    num_robots, conditions = truth.pos_x.shape[1], memory.conditions
     for world in range(mask.shape[0]):
-        if not mask[world]:
-            continue
-        c, step, learner = memory.conditions[world], truth.steps[world], truth.learner[world]
-        x, y, vx, vy = memory.known[0, world], memory.known[1, world], memory.known[2, world], memory.known[3, world]
-        draw = _first_draw(step, num_robots)
-        _report(world, step, truth, memory, p)
-        if c[RANGE] < np.inf or c[VIEW] > -2.0:
-            _hide_unseen(world, truth, memory, p)
-        if c[LOSS] > 0.0 or c[BURST] > 0.0 or c[DROPPED] > 0.0:
-            _hide_lost(world, draw, memory, p)
-        if c[NOISE] > 0.0:
-            add_normal(memory.stream[world], draw + 3, DRAWS, np.float32(c[NOISE]), x, y)
-        if c[MIX_UP] > 0.0:
-            _mix_up(world, learner, draw, memory, p)
-        x[learner], y[learner] = truth.pos_x[world, learner], truth.pos_y[world, learner]
-        vx[learner], vy[learner] = truth.vel_x[world, learner], truth.vel_y[world, learner]
+        if mask[world]:
+            _know(world, truth, memory, p)
+    for world in range(mask.shape[0]):
+        if mask[world] and conditions[world, NOISE] > 0.0:
+            draw, scale = _first_draw(truth.steps[world], num_robots) + 3, np.float32(conditions[world, NOISE])
+            add_normal(memory.stream[world], draw, DRAWS, scale, memory.known[POS_X, world], memory.known[POS_Y, world])
+    for world in range(mask.shape[0]):
+        if mask[world]:
+            if conditions[world, MIX_UP] > 0.0:
+                _mix_up(world, truth, memory, p)
+            _know_itself(world, truth, memory)
 
 
 @kernel
@@ -332,10 +381,9 @@ def _drive(steps, mask, command_x, command_y, stream, conditions, commands, para
         if not mask[world]:
             continue
         c, step, late = conditions[world], steps[world], commands[world]
-        late[step % p.command_ring, 0] = command_x[world]
-        late[step % p.command_ring, 1] = command_y[world]
-        place = (step + p.command_ring - int(c[COMMAND_DELAY])) % p.command_ring
-        x, y = late[place, 0], late[place, 1]
+        now, then = _places(step, late.shape[0], c[COMMAND_DELAY])
+        late[now, 0], late[now, 1] = command_x[world], command_y[world]
+        x, y = late[then, 0], late[then, 1]
         draw = _first_draw(step, num_robots) + DRAWS * num_robots
         speed = 1.0 + c[SPEED] * (2.0 * uniform_at(stream[world], draw + 1) - 1.0)
         turn = c[HEADING] * (2.0 * uniform_at(stream[world], draw + 2) - 1.0)

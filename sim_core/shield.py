@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_core.config import WorldConfig
-from sim_core.jit import inlined, kernel
+from sim_core.jit import StateKernel, inlined, kernel
 from sim_core.lanes import LANES, load, store
 from sim_core.orca import ORCAParams, build_half_planes, orca_params, orca_velocity
 from sim_core.packed import packed
@@ -153,7 +153,7 @@ class Shield:
     """
 
     def __init__(self, config: WorldConfig) -> None:
-        self._tile = shield_tile(config.num_robots)
+        self._project, self._tile = StateKernel(_project), shield_tile(config.num_robots)
         self._params = packed(shield_params(config))
 
     def project(
@@ -170,4 +170,4 @@ class Shield:
           mask: `[num_worlds]`.
           command_x, command_y: changed in place.
         """
-        _project(sensed, mask, command_x, command_y, self._tile, self._params)
+        self._project(sensed, mask, command_x, command_y, self._tile, self._params)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_core.config import WorldConfig
+from sim_core.jit import StateKernel
 from sim_core.methods import make_method
 from sim_core.outcomes import Outcome
 from sim_core.packed import packed
@@ -89,6 +90,9 @@ class WorldBatch:
         self.num_worlds = num_worlds
         self.num_rows = num_rows = num_worlds * config.num_learners
         self.method = make_method(config)
+        self._advance, self._end_step, self._reset_episode = map(StateKernel, (advance, end_step, reset_episode))
+        self._draw_learners, self._leave_worlds = StateKernel(draw_learners), StateKernel(leave_worlds)
+        self._mark_learner_collisions = StateKernel(mark_learner_collisions)
         self.state: WorldState = empty_state(config, num_worlds, np.float32)
         self.tile = world_tile(config, num_worlds, np.float32)
         self.swarm = packed(swarm_params(config, np.float32))
@@ -145,8 +149,8 @@ class WorldBatch:
         rows = self.rows_of(mask)
         self.scene.start(self._scene_state, mask)
         if self._several:
-            draw_learners(self.state, mask, self._scene_state.learner, self._counts)
-        reset_episode(self.state, mask)
+            self._draw_learners(self.state, mask, self._scene_state.learner, self._counts)
+        self._reset_episode(self.state, mask)
         self.outcome[rows] = int(Outcome.RUNNING)
         self._refresh(rows)
         if self._senses is not None:
@@ -235,10 +239,10 @@ class WorldBatch:
         """
         running, is_running, early = self._running, self._is_running, self._ended_early
         if self.config.ended_learners == "leave":
-            leave_worlds(self.state, running, is_running)
+            self._leave_worlds(self.state, running, is_running)
         is_given = self._give_command(action)
         command_x, command_y = self._command
-        advance(self.state, self.tile, is_running, running, command_x, command_y, is_given, self.swarm)
+        self._advance(self.state, self.tile, is_running, running, command_x, command_y, is_given, self.swarm)
         self._refresh(running)
         self.method.outcome(self._known, running, self.outcome)
         self.method.reward(self._known, running, self.outcome, self.step_reward)
@@ -246,9 +250,9 @@ class WorldBatch:
             self._senses.sense(running)
         if self._several:
             contact_sq = np.float32(2 * self.config.robot_radius_m) ** 2
-            mark_learner_collisions(self.state, running, self.outcome, contact_sq, self.hit_learner)
+            self._mark_learner_collisions(self.state, running, self.outcome, contact_sq, self.hit_learner)
         results = self.outcome, self.step_reward, self._reward, self._steps
-        any_running, any_early = end_step(self.state, running, is_running, early, *results)
+        any_running, any_early = self._end_step(self.state, running, is_running, early, *results)
         if any_early:
             self.method.perceive(self.sensed, early, self._observation)
             unseen &= ~early
@@ -303,7 +307,7 @@ class WorldBatch:
 
     def swarm_step(self) -> None:
         """Moves every world by one simulator step, the learning robot too, and nothing else: no outcome, no reward."""
-        advance(self.state, self.tile, self._all, self._all_rows, *self._command, False, self.swarm)
+        self._advance(self.state, self.tile, self._all, self._all_rows, *self._command, False, self.swarm)
         self._refresh(self._all_rows)
 
     def segregation(self) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sim_core.checks import require
 from sim_core.config import MAX_ROBOTS, WorldConfig
 from sim_core.episode_end import end_of_step
-from sim_core.jit import kernel
+from sim_core.jit import StateKernel, kernel
 from sim_core.methods.headings import heading_velocities, turn_headings, write_headings
 from sim_core.methods.progress import came_closer
 from sim_core.outcomes import Outcome
@@ -155,6 +155,7 @@ class Method:
         self.observation_shape: tuple[int, ...] = (len(self.observation_names(config)),)
         self.headings = heading_velocities(config, np.float32)
         self.episode_params = packed(episode_params(config))
+        self._end_of_step, self._step_reward = StateKernel(_outcome), StateKernel(_reward)
 
     @classmethod
     def observation_names(cls, config: WorldConfig) -> tuple[str, ...]:
@@ -233,7 +234,7 @@ class Method:
         By default that of 3.2.1: goal, collision, lost or captured as soon as no own robot is sensed; timeout at the
         horizon.
         """
-        _outcome(state, mask, out, self.episode_params)
+        self._end_of_step(state, mask, out, self.episode_params)
 
     def reward(
         self, state: WorldState, mask: NDArray[np.bool_], outcome: NDArray[np.int8], out: NDArray[np.float32]
@@ -245,7 +246,7 @@ class Method:
         By default Table 3.1, with the robot's own distance to the goal as "closer"; a timeout that is no failure is a
         step.
         """
-        _reward(state, mask, outcome, out, self.episode_params)
+        self._step_reward(state, mask, outcome, out, self.episode_params)
 
 
 class CheckedMethod(Method):

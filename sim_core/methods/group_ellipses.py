@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from sim_core.checks import require
 from sim_core.config import WorldConfig
 from sim_core.episode_end import collision_or_goal, lost_or_captured, sensed
-from sim_core.jit import kernel
+from sim_core.jit import StateKernel, kernel
 from sim_core.methods.apf import FieldParams, field_of, field_params
 from sim_core.methods.base import EpisodeParams, Method, Preset, Rule, episode_params
 from sim_core.methods.ellipse import (
@@ -223,6 +223,8 @@ class EllipseMethod(Method):
 
     def __init__(self, config: WorldConfig) -> None:
         super().__init__(config)
+        self._end_of_step, self._step_reward = StateKernel(_outcome), StateKernel(_reward)
+        self._perceive = StateKernel(_perceive)
         self.observation_limit = observation_limit(config)
         self._order = np.zeros(config.groups, np.int32)
         self._distance_sq = np.zeros(config.groups, np.float64)
@@ -289,14 +291,14 @@ class EllipseMethod(Method):
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.float32]) -> None:
         """4.2.1: the state matrix `[num_rows, rows * row_size]`, row after row."""
-        _perceive(state, mask, out, self._order, self._distance_sq, self._params)
+        self._perceive(state, mask, out, self._order, self._distance_sq, self._params)
 
     def outcome(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
         """4.2.1: goal, collision, lost or captured (see `lost_ends_episode`), timeout; counts `outside_steps`."""
-        _outcome(state, mask, out, self._params)
+        self._end_of_step(state, mask, out, self._params)
 
     def reward(
         self, state: WorldState, mask: NDArray[np.bool_], outcome: NDArray[np.int8], out: NDArray[np.float32]
     ) -> None:
         """Table 4.1: +tau/100 inside the own ellipse (see `ellipse_reward`), -tau/100 outside, +-tau at the end."""
-        _reward(state, mask, outcome, out, self._params)
+        self._step_reward(state, mask, outcome, out, self._params)

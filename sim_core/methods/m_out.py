@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sim_core.checks import require
 from sim_core.config import WorldConfig
-from sim_core.jit import kernel
+from sim_core.jit import StateKernel, kernel
 from sim_core.methods.apf import field_of, field_params, limited
 from sim_core.methods.base import Preset
 from sim_core.methods.group_ellipses import BEST_WORLD, MOST_GROUPS, POOLED, THESIS, TURNED, EllipseMethod
@@ -47,6 +47,7 @@ class OutsideMethod(EllipseMethod):
 
     def __init__(self, config: WorldConfig) -> None:
         super().__init__(config)
+        self._add_field = StateKernel(_add_field)
         self._field = packed(field_params(config))
         self._speed_limit_m_s = float(config.learner_speed_limit_m_s)
 
@@ -72,4 +73,4 @@ class OutsideMethod(EllipseMethod):
           ValueError: there is not one action a row, or one is none of the actions.
         """
         super().velocity(state, action, out_x, out_y)
-        _add_field(state, out_x, out_y, self._speed_limit_m_s, self._field)
+        self._add_field(state, out_x, out_y, self._speed_limit_m_s, self._field)

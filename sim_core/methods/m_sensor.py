@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sim_core.checks import require
 from sim_core.config import WorldConfig
-from sim_core.jit import kernel
+from sim_core.jit import StateKernel, kernel
 from sim_core.methods.base import Method, Preset, Rule
 from sim_core.methods.progress import goal_offset
 from sim_core.packed import packed
@@ -136,6 +136,7 @@ class SensorMethod(Method):
     def __init__(self, config: WorldConfig) -> None:
         super().__init__(config)
         self._faces_goal = config.sector_frame == "goal"
+        self._perceive, self._turn_to_goal = StateKernel(_perceive), StateKernel(_turn_to_goal)
         self._edges = sector_edges(config.sectors)
         real = np.float32
         self._params = packed(
@@ -204,8 +205,8 @@ class SensorMethod(Method):
         """
         super().velocity(state, action, out_x, out_y)
         if self._faces_goal:
-            _turn_to_goal(state, out_x, out_y)
+            self._turn_to_goal(state, out_x, out_y)
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
         """3.2.1: `[num_rows, 2q]` counts, the inner disc's q first; apart, 2q of the own group, then 2q of others."""
-        _perceive(state, mask, out, self._edges, self._params)
+        self._perceive(state, mask, out, self._edges, self._params)

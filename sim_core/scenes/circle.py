@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sim_core.checks import require
 from sim_core.config import WorldConfig
-from sim_core.jit import kernel
+from sim_core.jit import StateKernel, kernel
 from sim_core.rng import uniform
 from sim_core.scenes.base import DRAWN_MARGIN_M, GOAL_HALF_SIDE_M, Scene
 from sim_core.state import WorldState
@@ -85,7 +85,7 @@ class CircleScene(Scene):
 
     def __init__(self, config: WorldConfig) -> None:
         super().__init__(config)
-        self._params = circle_params(config)
+        self._start, self._params = StateKernel(_start), circle_params(config)
 
     @classmethod
     def reach_m(cls, config: WorldConfig) -> float:
@@ -128,4 +128,4 @@ class CircleScene(Scene):
 
     def start(self, state: WorldState, mask: NDArray[np.bool_]) -> None:
         """Writes positions, velocities, goals and learning robots of the worlds where `mask` `[num_worlds]` is set."""
-        _start(state, mask, self._params)
+        self._start(state, mask, self._params)

@@ -10,10 +10,13 @@ from sim_core.jit import kernel
 from sim_core.lanes import (
     LANES,
     any_lane,
+    convert,
     extract_lane,
     gather,
     gather_4,
+    lane_numbers,
     load,
+    load_some,
     maximum,
     minimum,
     scatter,
@@ -21,6 +24,8 @@ from sim_core.lanes import (
     splat,
     sqrt,
     store,
+    store_some,
+    view_bits,
 )
 
 REALS = (np.float32, np.float64)
@@ -222,6 +227,127 @@ def test_reading_and_writing_memory(dtype):
         for k in range(LANES):  # where an index is repeated, the last lane's value stays
             expected[indices[i, k]] = flat[LANES * i + k]
     assert_same_bits(scattered, expected)
+
+
+@kernel
+def _unsigned(a, b, out, masks):
+    vectors = a.shape[0] // LANES
+    for i in range(vectors):
+        x, y = load(a, i), load(b, i)
+        results = (x ^ y, x ^ a[0], x >> a[8], x * y, x + a[1])
+        for k in range(len(results)):
+            store(out, k * vectors + i, results[k])
+        store(masks, i, select(x < y, splat(1), splat(0)))
+
+
+@pytest.mark.parametrize("dtype", [np.uint64, np.uint8])
+def test_whole_numbers_without_a_sign(dtype):
+    most = int(np.iinfo(dtype).max)
+    numbers = np.array([1, most, 0, most // 2, most // 2 + 1, 77, 3, most - 5, 6, *range(11, 18)], dtype)
+    a, b = np.ascontiguousarray(np.array(list(itertools.product(numbers, repeat=2)), dtype).T)
+    out, masks = np.zeros((5, len(a)), dtype), np.zeros(len(a), np.int32)
+    _unsigned(a, b, out, masks)
+    with np.errstate(over="ignore"):
+        expected = {"x ^ y": a ^ b, "x ^ s": a ^ a[0], "x >> s": a >> a[8], "x * y": a * b, "x + s": a + a[1]}
+    assert_all_same(out, expected)
+    np.testing.assert_array_equal(masks != 0, a < b)
+
+
+@kernel
+def _shifts(a, out):
+    for i in range(a.shape[0] // LANES):
+        store(out, i, load(a, i) >> np.int32(3))
+
+
+def test_a_shift_keeps_the_sign():
+    a, _ = pairs(np.int32)
+    out = np.zeros_like(a)
+    _shifts(a, out)
+    np.testing.assert_array_equal(out, a >> 3)
+
+
+@kernel
+def _convert(source, out, dtype):
+    for i in range(source.shape[0] // LANES):
+        store(out, i, convert(load(source, i), dtype))
+
+
+CONVERSIONS = [
+    (np.int32, np.float32), (np.int32, np.float64), (np.int32, np.uint64), (np.uint64, np.float64),
+    (np.uint64, np.uint32), (np.uint32, np.float32), (np.uint8, np.int32), (np.float32, np.float64),
+    (np.float64, np.float32), (np.float32, np.float32),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("source, target", CONVERSIONS)
+def test_conversions(source, target):
+    if np.issubdtype(source, np.floating):
+        numbers = np.resize(special_numbers(source), 32)
+    else:
+        limits = np.iinfo(source)
+        ends = [int(limits.min), int(limits.max), int(limits.max) // 2 + 1, int(limits.max) // 3]
+        numbers = np.array([*ends, *range(12)], np.dtype(source))
+    out = np.zeros(len(numbers), target)
+    _convert(numbers, out, target)
+    with np.errstate(all="ignore"):
+        assert_same_bits(out, numbers.astype(target))
+
+
+@kernel
+def _view(source, out, dtype):
+    for i in range(source.shape[0] // LANES):
+        store(out, i, view_bits(load(source, i), dtype))
+
+
+@pytest.mark.parametrize("source, target", [(np.float32, np.int32), (np.int32, np.float32), (np.uint32, np.int32)])
+def test_bits_are_read_as_another_type(source, target):
+    numbers = np.arange(1, 33, dtype=source)
+    out = np.zeros(32, target)
+    _view(numbers, out, target)
+    np.testing.assert_array_equal(out, numbers.view(target))
+
+
+@kernel
+def _copy_some(source, first, count, target, at, all_lanes):
+    some = load_some(source, first, count)
+    store(all_lanes, 0, some)
+    store_some(target, at, count, some)
+
+
+@pytest.mark.parametrize("dtype", [*TYPES, np.uint8, np.uint64])
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 8, 11])
+def test_some_lanes_are_read_and_written_and_nothing_beyond(dtype, count):
+    source, target = np.arange(1, 21, dtype=dtype), np.full(20, 77, dtype)
+    lanes, most = np.full(LANES, 55, dtype), min(count, LANES)
+    _copy_some(source, 5, count, target, 3, lanes)
+    np.testing.assert_array_equal(lanes, [*source[5 : 5 + most], *[0] * (LANES - most)])
+    np.testing.assert_array_equal(target[3 : 3 + most], source[5 : 5 + most])
+    assert (np.delete(target, np.s_[3 : 3 + most]) == 77).all()
+
+
+@kernel
+def _number(out):
+    store(out, 0, lane_numbers())
+
+
+def test_lanes_have_numbers():
+    out = np.zeros(LANES, np.int32)
+    _number(out)
+    np.testing.assert_array_equal(out, np.arange(LANES))
+
+
+def _truncates(a):
+    store(a, 0, convert(load(a, 0), np.int32))
+
+
+def _views_another_size(a):
+    store(a, 0, view_bits(load(a, 0), np.float64))
+
+
+@pytest.mark.parametrize("function", [_truncates, _views_another_size])
+def test_conversions_that_lose_numbers_are_refused(function):
+    with pytest.raises(TypingError):
+        kernel(function)(np.zeros(LANES, np.float32))
 
 
 def _adds(a, b):
