@@ -23,6 +23,9 @@ OURS = "shoal"
 LIMIT = "the limit"
 TWO_WORKERS = "2 workers"
 """A style of ours: rollout workers beside the learner; where simulating is what takes time, one is too few."""
+SHORT_BLOCKS = "short blocks"
+"""A style of ours: blocks and calls of updates as short as in the presets (`learner.presets`). The learner begins
+earlier, and more messages are sent."""
 
 
 class Contest(NamedTuple):
@@ -58,9 +61,11 @@ class Contender(NamedTuple):
     python: str = sys.executable
 
     def styles(self, contest: Contest) -> list[Style]:
-        if self.module in ("shoal", "limit"):
-            kinds = ("", TWO_WORKERS) if self.module == "shoal" else ("",)
-            return [Style(envs, 1, kind) for kind in kinds for envs in (16, 64, 128)]
+        if self.module == "limit":
+            return [Style(envs, 1) for envs in (16, 64, 128)]
+        if self.module == "shoal":
+            kinds = ("", TWO_WORKERS, SHORT_BLOCKS, f"{TWO_WORKERS}, {SHORT_BLOCKS}")
+            return [Style(envs, 1, kind) for kind in kinds for envs in (64, 128)]
         if self.module == "sb3":
             kinds = ("", "vectorised") if contest.config.env.is_swarm else ("",)
             return [Style(envs, threads, kind) for kind in kinds for envs in (8, 64, 256) for threads in (1, 2)]
@@ -71,8 +76,7 @@ def contests() -> dict[str, Contest]:
     cartpole = from_dict(tomllib.loads((ROOT / "deploy/configs/cartpole.toml").read_text("utf-8")))
     often = {"eval_every_env_steps": 10_000, "eval_episodes": 200, "checkpoint_every_env_steps": 10**9}
     seldom = {"total_env_steps": 10**8, "eval_every_env_steps": 10**9, "checkpoint_every_env_steps": 10**9}
-    # decisions and blocks as in the preset `best`: a block of 128 decisions of 4 steps each would come late
-    swarm = RunConfig(world=WorldConfig(decision_interval_steps=4), steps_per_block=32, updates_per_call=32)
+    swarm = RunConfig(world=WorldConfig(decision_interval_steps=4))  # as the preset `best` decides
     wide = RunConfig(world=WorldConfig(method="in", robots=5, groups=8))
     return {
         "cartpole": Contest(

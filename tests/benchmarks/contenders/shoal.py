@@ -3,15 +3,20 @@
 import dataclasses
 
 from actors.policy.policy import WeightsSnapshot
+from learner.presets import preset_config
 from tests.benchmarks.contest import Finding, Heat, Lap, compete
-from tests.benchmarks.entrants import TWO_WORKERS
+from tests.benchmarks.entrants import SHORT_BLOCKS, TWO_WORKERS
 from tests.benchmarks.ray_service import ray_service
 from tests.checkpointing import Silent
 
 
 def train(heat: Heat) -> Finding:
-    workers = 2 if heat.variant == TWO_WORKERS else 1
+    workers = 2 if TWO_WORKERS in heat.variant else 1
     config = dataclasses.replace(heat.config, workers=workers, envs_per_worker=heat.envs, eval_every_env_steps=10**9)
+    if SHORT_BLOCKS in heat.variant:
+        preset = preset_config("best", config.world.method)
+        blocks = {"steps_per_block": preset.steps_per_block, "updates_per_call": preset.updates_per_call}
+        config = dataclasses.replace(config, **blocks)
     with ray_service(config) as make_loop:
 
         def weights() -> WeightsSnapshot:
