@@ -6,6 +6,7 @@ only acts has to import. A test checks that both compute the same function.
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +38,19 @@ class WeightsSnapshot(NamedTuple):
     time_s: float
     arrays: tuple[NDArray[np.float32], ...]
     row_size: int = 0
+
+
+def blank_weights(
+    observation_size: int, hidden_sizes: tuple[int, ...], num_actions: int, row_size: int = 0
+) -> WeightsSnapshot:
+    """Weights of zeros of a plain network, or if `row_size` is above 0, of a pooled one; for rehearsals."""
+    shared, sizes = list[tuple[int, int]](), (observation_size, *hidden_sizes, num_actions)
+    if row_size:
+        width, *hidden = hidden_sizes
+        shared, sizes = [(row_size, width), (width, width)], (row_size + width, *hidden, num_actions)
+    layers = [*shared, *itertools.pairwise(sizes)]
+    arrays = [array for fan_in, fan_out in layers for array in (np.zeros((fan_out, fan_in)), np.zeros(fan_out))]
+    return WeightsSnapshot(0, 0.0, tuple(array.astype(np.float32) for array in arrays), row_size)
 
 
 class Policy:

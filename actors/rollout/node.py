@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
@@ -17,7 +18,7 @@ from safetensors.numpy import load_file
 from safetensors.numpy import save as to_bytes
 
 from actors.policy.policy import WeightsSnapshot
-from actors.rollout.worker import RolloutSettings, RolloutWorker
+from actors.rollout.worker import RolloutSettings, RolloutWorker, rehearse
 from actors.service.fault_policy import Action, CallFailed, ComponentKind, Fault, decide
 from actors.service.messages import (
     ACTS,
@@ -112,6 +113,16 @@ class RolloutNode:
         Of an error while an actor is made, Ray would keep the text alone.
         """
         return RolloutWorker(*self._origin)
+
+    def prepare(self, blank: WeightsSnapshot) -> None:
+        """Makes the worker and loads the simulator's code while other nodes still start; nobody needs the answer.
+
+        Args:
+          blank: any weights of the policy's shape.
+        """
+        with suppress(Exception):  # the first call that needs the worker raises it again
+            if self._worker and self._origin[0].env.is_swarm:
+                rehearse(self._origin[0], blank)
 
     def replace_shard(self, index: int, shard: Handle[PushTarget], incarnation: int) -> None:
         """Pushes to `shard`, of this incarnation, in place of the shard of this index."""

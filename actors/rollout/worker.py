@@ -37,6 +37,24 @@ class RolloutSettings(NamedTuple):
     seed: int
 
 
+REHEARSED_ENVS = 8
+"""Environments of a rehearsal: what a vector of the simulator's kernels holds."""
+
+
+def rehearse(settings: RolloutSettings, weights: WeightsSnapshot) -> None:
+    """Loads all code that a rollout worker runs, by a short block of a worker that is thrown away.
+
+    Args:
+      settings: of the worker that is to be.
+      weights: any of its policy's shape.
+    """
+    small = settings._replace(num_envs=min(settings.num_envs, REHEARSED_ENVS), steps_per_block=settings.n_step + 1)
+    worker = RolloutWorker(small, 0, 0)
+    worker.set_weights(weights)
+    worker.collect(0.0)
+    worker.close()
+
+
 class RolloutWorker:
     """Steps `num_envs` environments; one `collect` makes one block of `num_envs * steps_per_block` env steps.
 

@@ -21,13 +21,14 @@ import ray
 from ray.exceptions import AuthenticationError
 
 from actors.evaluation.evaluator import Candidate, evaluate, evaluate_in_parallel, is_short
+from actors.policy.policy import WeightsSnapshot, blank_weights
 from actors.replay.node import ShardNode
 from actors.rollout.env_spec import EnvSpec
 from actors.rollout.node import RolloutNode
 from actors.rollout.vector_env import EnvShape, env_shape
 from actors.service.fault_policy import CallFailed, RunFailed
 from actors.service.messages import EpisodeStats
-from actors.service.rpc import Handle, LocalCalls, Ref, by_reference, local_handle
+from actors.service.rpc import Handle, LocalCalls, Ref, local_handle
 from learner.cluster_options import DEADLINE_S, ClusterOptions
 from learner.config import RunConfig
 from learner.ray_backend.auth import TOKEN_HELP, guard_ray
@@ -308,11 +309,19 @@ class RayCluster(Cluster):
         """Starts the actor of a rollout worker, or makes a spare one."""
         arguments = (worker_id, incarnation, self._node_calls, self.targets, PUSHES_IN_FLIGHT)
         spare = self._spare_workers.take(*arguments)
-        return spare or _start_actor(RolloutNode, 0, rollout_settings(self.config), *arguments)
+        if spare is not None:
+            return spare
+        worker = _start_actor(RolloutNode, 0, rollout_settings(self.config), *arguments)
+        self.calls.start(worker, RolloutNode.prepare, self._blank_weights())
+        return worker
+
+    def _blank_weights(self) -> WeightsSnapshot:
+        config, shape = self.config, self._shape
+        row_size = config.env.row_size if config.network == "pooled" else 0
+        return blank_weights(shape.observation_size, config.policy_sizes, shape.num_actions, row_size)
 
     def _start_spare_worker(self) -> Handle[SpareWorker]:
-        weights = by_reference(self.calls.start(self.learner, LearnerNode.weights))
-        return _start_actor(SpareWorker, 0, rollout_settings(self.config), weights)
+        return _start_actor(SpareWorker, 0, rollout_settings(self.config), self._blank_weights())
 
     def place_shard(self, index: int, incarnation: int) -> Handle[ShardNode]:
         """Starts the actor of an empty shard, or makes a spare one."""

@@ -16,7 +16,7 @@ from ray.exceptions import RayError
 from actors.policy.policy import WeightsSnapshot
 from actors.replay.node import ShardNode, ShardSettings
 from actors.rollout.node import PushTarget, RolloutNode
-from actors.rollout.worker import RolloutSettings, RolloutWorker
+from actors.rollout.worker import RolloutSettings, rehearse
 from actors.service.rpc import Calls, Handle
 
 N = TypeVar("N")
@@ -42,14 +42,12 @@ class SpareWorker(Spare, RolloutNode):
 
     Args:
       settings: of the workers.
-      weights: any, for the rehearsal.
+      blank: any weights of the policy's shape, for the rehearsal.
     """
 
-    def __init__(self, settings: RolloutSettings, weights: WeightsSnapshot) -> None:
+    def __init__(self, settings: RolloutSettings, blank: WeightsSnapshot) -> None:
         self._settings = settings
-        rehearsal = RolloutWorker(settings, 0, 0)
-        rehearsal.set_weights(weights)
-        rehearsal.collect(0.0)
+        rehearse(settings, blank)
 
     def begin(
         self,

@@ -8,8 +8,10 @@ import numpy as np
 import psutil
 import pytest
 
-from actors.policy.policy import WeightsSnapshot
+from actors.policy.network import snapshot
+from actors.policy.policy import WeightsSnapshot, blank_weights
 from actors.replay.node import ShardNode
+from actors.rollout.env_spec import EnvSpec
 from actors.rollout.node import RolloutNode
 from actors.rollout.vector_env import env_shape
 from actors.service.rpc import LocalCalls, local_handle
@@ -17,6 +19,7 @@ from deploy.chaos.processes import TITLES
 from learner.cluster_options import ClusterOptions
 from learner.ray_backend.spares import SpareShard, SpareWorker
 from learner.training.cluster import rollout_settings, shard_settings
+from learner.update.networks import acting_network
 from tests.integration.conftest import PATIENCE_S, SMALL
 
 
@@ -33,18 +36,42 @@ def weights(config):
     return WeightsSnapshot(3, 0.0, tuple(layers), 0)
 
 
-def test_a_spare_that_has_begun_is_a_new_worker_bit_for_bit():
+@pytest.mark.parametrize("history", [1, 2])
+def test_blank_weights_have_the_shape_of_the_acting_network(history):
+    plain = dataclasses.replace(SMALL, world=dataclasses.replace(SMALL.world, method="in", history=history))
+    for kind in ("plain", "dueling", "pooled"):
+        config = dataclasses.replace(plain, network=kind)
+        shape = env_shape(config.env)
+        row_size = config.env.row_size if kind == "pooled" else 0
+        blank = blank_weights(shape.observation_size, config.policy_sizes, shape.num_actions, row_size)
+        theirs = snapshot(acting_network(config, shape), 0, 0.0)
+        assert [array.shape for array in blank.arrays] == [array.shape for array in theirs.arrays]
+        assert blank.row_size == theirs.row_size and not any(array.any() for array in blank.arrays)
+
+
+def test_a_worker_that_cannot_be_made_says_so_in_the_call_that_needs_it():
+    settings = rollout_settings(SMALL)._replace(env=EnvSpec("NoSuchEnv-v0", SMALL.world))
+    worker = RolloutNode(settings, 0, 0, LocalCalls(), [None], 0)
+    worker.prepare(weights(SMALL))
+    with pytest.raises(Exception, match="NoSuchEnv"):
+        worker.set_weights(weights(SMALL))
+
+
+@pytest.mark.parametrize("kind", ["prepared", "spare"])
+def test_a_rehearsed_worker_does_what_a_new_one_does_bit_for_bit(kind):
     settings, shape = rollout_settings(SMALL), env_shape(SMALL.env)
     stored = []
-    for spare in (False, True):
+    for rehearsed in (False, True):
         shard = ShardNode(shard_settings(SMALL, shape)[0])
         arguments = (1, 7, LocalCalls(), [local_handle(shard)], 0)
-        if spare:
+        if rehearsed and kind == "spare":
             worker = SpareWorker(settings, weights(SMALL))
             assert worker.is_ready()
             worker.begin(*arguments)
         else:
             worker = RolloutNode(settings, *arguments)
+            if rehearsed:
+                worker.prepare(weights(SMALL))
         worker.set_weights(weights(SMALL))
         (report,) = worker.collect(0.2)
         assert (report.header.worker_id, report.header.incarnation, report.header.sequence) == (1, 7, 0)
