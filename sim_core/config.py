@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 MAX_HEADINGS = 64
 MAX_HISTORY = 16
 MAX_DELAY_STEPS = 10
+MAX_TRACK_STEPS = 1_000
 MAX_ROBOTS = 100_000
 """Most robots of one world."""
 LARGEST = 1e6
@@ -197,6 +198,9 @@ class WorldConfig:
     """Angle of all sensing around the direction of motion, at rest that of the goal."""
     group_mix_up: float = 0.0
     """Probability that in a step a robot is taken for one of another group, and that one for it."""
+    track_steps: int = 0
+    """Simulator steps for which a robot that is sensed no more is taken to go on with its last velocity; then it is not
+    known any more."""
     command_delay_steps: int = 0
     """Simulator steps until a velocity command takes effect; the robot rests until the first one does."""
     speed_error: float = 0.0
@@ -480,6 +484,10 @@ def _check_conditions(config: WorldConfig) -> None:
     for name in ("position_delay_steps", "command_delay_steps"):
         delay = getattr(config, name)
         require(0 <= delay <= MAX_DELAY_STEPS, f"{name} must be between 0 and {MAX_DELAY_STEPS}, not {delay}")
+    require(
+        0 <= config.track_steps <= MAX_TRACK_STEPS,
+        f"track_steps must be between 0 and {MAX_TRACK_STEPS}, not {config.track_steps}",
+    )
     require(
         1 <= config.burst_steps <= LARGEST, f"burst_steps must be between 1 and {LARGEST:.0e}, not {config.burst_steps}"
     )

@@ -5,7 +5,7 @@ robots are as the learning robot knows them. NaN stands for a robot that it does
 true state, and the robot's own position, velocity and goal are always true.
 
 In every simulator step, another robot's position is late (a ring of past states), then known or not (dropped for the
-episode, out of range or view, in a burst of loss, lost by itself), then noisy; last, some are mixed up with robots of
+episode, out of range or view, in a burst of loss, lost by itself), then noisy; some are mixed up with robots of
 other groups. A burst is the bad state of a channel of two states, one channel a robot, which begins in its stationary
 distribution (Gilbert 1960, "Capacity of a burst-noise channel"). A velocity command takes effect late, and is driven
 with an error of speed and heading.
@@ -40,8 +40,11 @@ IS_DROPPED, IN_BURST = np.uint8(1), np.uint8(2)
 """Bits of `Memory.channel`."""
 POS_X, POS_Y, VEL_X, VEL_Y = range(4)
 """Rows of what is known of robots."""
+AGE = 4
+"""Row of `Memory.tracked` below those."""
 _PASSED = ("pos_x", "pos_y", "vel_x", "vel_y")
 _NAN, _NO_BITS = np.float32(np.nan), np.uint8(0)
+_NO_AGE, _ONE_STEP = np.float32(0), np.float32(1)
 
 
 class SenseParams(NamedTuple):
@@ -55,6 +58,8 @@ class SenseParams(NamedTuple):
     group_begin: NDArray[np.int32]
     drawn: bool
     leave_burst: float
+    track_steps: Any
+    time_step_s: Any
 
 
 class Truth(NamedTuple):
@@ -78,7 +83,8 @@ class Memory(NamedTuple):
     `[num_worlds, 11]` float64, those of the episode (RANGE infinite without a limit; VIEW the cosine of half the angle,
     -2 all around; HEADING in radians); channel `[num_worlds, num_robots]` uint8, IS_DROPPED and IN_BURST; past
     `[num_worlds, delay + 1, 4, num_robots]` float32, the true positions and velocities of the simulator steps modulo
-    delay + 1.
+    delay + 1; tracked `[num_worlds, 5, num_robots]` float32, where each robot was sensed last or its last velocity has
+    taken it since, that velocity, and the simulator steps since; empty where nothing is tracked.
     """
 
     known: Any
@@ -86,6 +92,7 @@ class Memory(NamedTuple):
     conditions: Any
     channel: Any
     past: Any
+    tracked: Any
 
 
 def sense_params(config: WorldConfig, state: WorldState) -> SenseParams:
@@ -109,6 +116,8 @@ def sense_params(config: WorldConfig, state: WorldState) -> SenseParams:
         group_begin=state.group_begin,
         drawn=config.conditions == "drawn",
         leave_burst=1.0 / config.burst_steps,
+        track_steps=np.float32(config.track_steps),
+        time_step_s=np.float32(config.time_step_s),
     )
 
 
@@ -121,6 +130,7 @@ def empty_memory(config: WorldConfig, num_worlds: int) -> Memory:
         conditions=np.zeros((num_worlds, NUM_CONDITIONS)),
         channel=np.zeros((num_worlds, robots), np.uint8),
         past=np.zeros((num_worlds, config.position_delay_steps + 1, 4, robots), np.float32),
+        tracked=np.zeros((num_worlds, AGE + 1, robots if config.track_steps else 0), np.float32),
     )
 
 
@@ -179,6 +189,7 @@ def _begin(rng, truth, mask, memory, commands, params):
         _open_channels(world, truth, memory, NUM_CONDITIONS + 1, p)
         for place in range(memory.past.shape[1]):
             _remember(world, truth, memory.past[world, place])
+        memory.tracked[world, AGE, :] = p.track_steps
         commands[world, :] = np.float32(0)
 
 
@@ -346,6 +357,27 @@ def _mix_up(world, truth, memory, p):
 
 
 @inlined
+def _track(world, memory, p):
+    """Writes where the robots that are not sensed any more have gone with their last velocities, for `track_steps`."""
+    num_robots, step_s = memory.tracked.shape[2], p.time_step_s
+    size = memory.known.shape[1] * num_robots
+    for i in range(0, num_robots, LANES):
+        count, at, kept = num_robots - i, world * num_robots + i, world * (AGE + 1) * num_robots + i
+        x, y, vx, vy = _load_rows(memory.known, at, size, count)
+        last_x, last_y, last_vx, last_vy = _load_rows(memory.tracked, kept, num_robots, count)
+        age = load_some(memory.tracked, kept + AGE * num_robots, count)
+        sensed, is_tracked = x == x, age < p.track_steps
+        last_x, last_y = select(sensed, x, last_x + last_vx * step_s), select(sensed, y, last_y + last_vy * step_s)
+        last_vx, last_vy = select(sensed, vx, last_vx), select(sensed, vy, last_vy)
+        age = select(sensed, _NO_AGE, select(is_tracked, age + _ONE_STEP, age))
+        _store_rows(memory.tracked, kept, num_robots, count, last_x, last_y, last_vx, last_vy)
+        store_some(memory.tracked, kept + AGE * num_robots, count, age)
+        known = sensed | is_tracked
+        x, y = select(known, last_x, _NAN), select(known, last_y, _NAN)
+        _store_rows(memory.known, at, size, count, x, y, select(known, last_vx, _NAN), select(known, last_vy, _NAN))
+
+
+@inlined
 def _know_itself(world, truth, memory):
     """Writes the learning robot's own position and velocity, which it always knows."""
     learner, known = truth.learner[world], memory.known
@@ -370,6 +402,8 @@ def _sense(truth, mask, memory, params):
         if mask[world]:
             if conditions[world, MIX_UP] > 0.0:
                 _mix_up(world, truth, memory, p)
+            if p.track_steps > 0.0:
+                _track(world, memory, p)
             _know_itself(world, truth, memory)
 
 

@@ -12,14 +12,15 @@ from sim_core.config import COMMAND_CONDITIONS, SENSE_CONDITIONS, WorldConfig
 
 CONDITIONS = (*SENSE_CONDITIONS, *COMMAND_CONDITIONS, "burst_steps")
 """Fields of the world that a grid sets; what no axis names has its default."""
-VARIABLE = (*CONDITIONS, "shield", "kinematics", "turn_rate_limit_deg_s", "acceleration_limit_m_s2")
+VARIABLE = (*CONDITIONS, "track_steps", "shield", "kinematics", "turn_rate_limit_deg_s", "acceleration_limit_m_s2")
 """Fields of the world that an axis may name."""
 PART_OF = {
-    "turn_rate_limit_deg_s": ("kinematics", "unicycle"),
-    "acceleration_limit_m_s2": ("kinematics", "unicycle"),
-    "burst_steps": ("burst_loss", "0.3"),
+    "turn_rate_limit_deg_s": (("kinematics",), "kinematics=unicycle"),
+    "acceleration_limit_m_s2": (("kinematics",), "kinematics=unicycle"),
+    "burst_steps": (("burst_loss",), "burst_loss=0.3"),
+    "track_steps": (("position_loss", "burst_loss", "sensing_range_m", "field_of_view_deg"), "position_loss=0.5"),
 }
-"""Fields that change nothing where another has its default; with a value of that other one."""
+"""Fields that change nothing where others all have their defaults; with an axis of one of those."""
 DEFAULTS = {field.name: field.default for field in dataclasses.fields(WorldConfig)}
 BROKEN = 0.5
 """A player breaks where its success rate falls to this."""
@@ -96,9 +97,9 @@ def check_effects(axes: Sequence[Axis], worlds: Sequence[WorldConfig]) -> None:
     """
     for axis in axes:
         if axis.name in PART_OF:
-            other, value = PART_OF[axis.name]
-            has_effect = any(getattr(world, other) != DEFAULTS[other] for world in worlds)
-            require(has_effect, f"{axis.name} changes nothing by itself; add --vary {other}={value}")
+            others, example = PART_OF[axis.name]
+            has_effect = any(getattr(world, other) != DEFAULTS[other] for world in worlds for other in others)
+            require(has_effect, f"{axis.name} changes nothing by itself; add --vary {example}")
 
 
 def along(axis: Axis, axes: Sequence[Axis]) -> list[Condition]:

@@ -50,6 +50,7 @@ class Oracle:
         ]
         self.draw += 2 * self.n
         self.past: list[np.ndarray] = []
+        self.tracked, self.age = np.zeros((self.n, 4)), [config.track_steps] * self.n
         self.commands: list[np.ndarray] = []
 
     def real(self, name: str, place: int) -> float:
@@ -105,6 +106,16 @@ class Oracle:
                     j = others[int(uniform(self.stream, at + 5) * len(others))]
                     seen[[i, j]] = seen[[j, i]]
 
+    def _track(self, seen: np.ndarray) -> None:
+        """In place of a robot that is not sensed any more, where its last velocity has taken it."""
+        for i in range(self.n):
+            if not np.isnan(seen[i, 0]):
+                self.tracked[i], self.age[i] = seen[i], 0
+            elif self.age[i] < self.config.track_steps:
+                self.tracked[i, :2] += self.tracked[i, 2:] * self.config.time_step_s
+                seen[i] = self.tracked[i]
+                self.age[i] += 1
+
     def look(self) -> np.ndarray:
         """What is sensed now, `[num_robots, 4]`."""
         truth = self.truth()
@@ -117,6 +128,7 @@ class Oracle:
             else:
                 seen[i, :2] += self._noise(i)
         self._mix_up(seen)
+        self._track(seen)
         seen[self.learner] = truth[self.learner]
         self.draw += 5 * self.n + 2
         return seen

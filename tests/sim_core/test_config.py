@@ -13,6 +13,7 @@ from sim_core.config import (
     LARGEST_REWARD,
     MAX_DELAY_STEPS,
     MAX_HEADINGS,
+    MAX_TRACK_STEPS,
     NON_NEGATIVE,
     POSITIVE,
     SHARES,
@@ -144,6 +145,7 @@ def test_a_speed_error_counts_for_the_distance_of_a_step():
         ("outside_limit_steps", 0, 1, None, None),
         ("position_delay_steps", -1, 0, MAX_DELAY_STEPS, MAX_DELAY_STEPS + 1),
         ("command_delay_steps", -1, 0, MAX_DELAY_STEPS, MAX_DELAY_STEPS + 1),
+        ("track_steps", -1, 0, MAX_TRACK_STEPS, MAX_TRACK_STEPS + 1),
         ("dropped_mates", -1, 0, 9, 10),  # of 10 robots a group one is the learning robot
     ],
 )

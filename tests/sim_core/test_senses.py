@@ -28,6 +28,7 @@ SENSES = {
     "sensing_range_m": 2.5,
     "field_of_view_deg": 250.0,
     "group_mix_up": 0.1,
+    "track_steps": 3,
 }
 DRIVES = {"command_delay_steps": 2, "speed_error": 0.3, "heading_error_deg": 20.0}
 METHODS = ("sensor", "in", "out")
@@ -119,6 +120,27 @@ def test_losses_are_as_frequent_as_they_should_be():
         lost.append(np.isnan(worlds.sensed.pos_x)[others(worlds)])
     running = np.concatenate(lost[:15])
     assert abs(running.mean() - 0.3) < 4 * math.sqrt(0.21 / running.size)
+
+
+def test_a_robot_that_is_lost_is_tracked_at_its_last_velocity_for_so_many_steps():
+    worlds = wide(200, position_loss=0.5, track_steps=2)
+    plain = wide(200, position_loss=0.5)
+    unknown, followed = [], 0
+    for _ in range(20):
+        before, lost = sensed(worlds), np.isnan(plain.sensed.pos_x)
+        for batch in (worlds, plain):
+            batch.step(np.zeros(200, np.int64))
+        now, known = sensed(worlds), others(worlds)
+        unknown.append(np.isnan(now[..., 0])[known])
+        gone = np.isnan(plain.sensed.pos_x) & ~lost & known  # sensed in the last step, not in this one
+        expected = before[gone]
+        expected[:, :2] += expected[:, 2:] * worlds.config.time_step_s
+        np.testing.assert_allclose(now[gone], expected, atol=1e-6)
+        seen = ~np.isnan(plain.sensed.pos_x)
+        np.testing.assert_array_equal(now[seen], sensed(plain)[seen])
+        followed += gone.sum()
+    share = np.concatenate(unknown[3:])
+    assert followed > 1000 and abs(share.mean() - 0.125) < 0.01, "lost three times in a row"
 
 
 def test_bursts_have_their_share_and_their_mean_length():
