@@ -6,12 +6,13 @@ RUNTIME := $(VENV)/.runtime-ready
 READY := $(VENV)/.dev-ready
 RLLIB := $(VENV)/rllib
 PIP := -m pip install --quiet --disable-pip-version-check --no-compile
+ROBOT_PEERS := $(VENV)/robot-peers
 VMAS := vmas==1.5.2 gym==0.26.2 gym-notices==0.0.8 six==1.17.0 pyglet==1.5.27
 INSTALL := $(PIP) --constraint .ci/constraints.txt --editable
 # Python compiles the modules that it imports, once. pip would compile all, which takes longer than a first training saves.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: train test lint style types kernels constraints bench bench-peers bench-robots bench-exactness reproduce generalist shares robustness overestimation fuzz soak setup clean
+.PHONY: train test lint style types kernels constraints bench bench-peers bench-robots bench-exactness reproduce generalist league shares robustness overestimation fuzz soak setup clean
 
 setup: $(READY)
 
@@ -67,9 +68,15 @@ bench: $(READY)
 bench-peers: $(VENV)/.peers $(RLLIB)/.ready
 	$(BIN)/python -m tests.benchmarks.peers --rllib $(RLLIB)/bin/python $(ARGS)
 
-# Steps of learning robots beside VMAS, which lives in a folder of its own, since it needs Gymnasium's predecessor.
-bench-robots: $(VENV)/vmas/.ready
-	$(BIN)/python -W ignore -m tests.benchmarks.robot_peers --vmas $(VENV)/vmas
+# Steps of learning robots beside VMAS, which lives in a folder of its own, since it needs Gymnasium's predecessor, and
+# beside CAMAR, JaxNav and IR-SIM, which have an interpreter of their own with JAX. ARGS="--robots 10 --rounds 2" for some.
+bench-robots: $(VENV)/vmas/.ready $(ROBOT_PEERS)/.ready
+	$(BIN)/python -m tests.benchmarks.robot_peers --vmas $(VENV)/vmas --peers $(ROBOT_PEERS)/bin/python $(ARGS)
+
+$(ROBOT_PEERS)/.ready: $(READY)
+	$(PYTHON) -m venv $(ROBOT_PEERS)
+	$(ROBOT_PEERS)/bin/python $(PIP) camar==0.4.0 jaxmarl==0.2.0 ir-sim==2.12.0 jax==0.10.2
+	touch $@
 
 $(VENV)/vmas/.ready: $(READY)
 	$(BIN)/python $(PIP) --no-deps --target $(VENV)/vmas $(VMAS)
@@ -96,6 +103,15 @@ reproduce: $(READY)
 # ARGS="--methods sensor --seeds 0" for one.
 generalist: $(READY)
 	$(BIN)/python -m tests.benchmarks.generalist $(ARGS)
+
+# Our policies, the rules, FL-ORCA and the published GA3C-CADRL, whose package is there for its weights alone.
+# ARGS="--setups 10x2 --episodes 200" for some.
+league: $(VENV)/cadrl/.ready
+	$(BIN)/python -m tests.benchmarks.league --cadrl $(VENV)/cadrl $(ARGS)
+
+$(VENV)/cadrl/.ready: $(READY)
+	$(BIN)/python $(PIP) --no-deps --target $(VENV)/cadrl gym-collision-avoidance==0.0.3
+	touch $@
 
 # One robot, a quarter, half or all of a swarm learn, and each policy plays at every share; half a minute a training.
 # ARGS="--methods sensor --setups 10x2 --seeds 0" for some.

@@ -71,7 +71,7 @@ def _run_missing(command: Sweep, name: str, results: SweepResults, missing: list
     launch = command.launch
     location = SweepLocation(results.folder / CELLS, launch.tracking(), launch.experiment_of("sweep", name))
     # Makes the store and the experiment here, before several processes open them.
-    Tracker(location.tracking_uri, location.experiment, launch.artifact_root()).set_views()
+    Tracker(location.tracking_uri, location.experiment, launch.artifact_root())
     results.record_provenance()
     with display:
         listener = _Listener(display, results)

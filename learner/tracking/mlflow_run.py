@@ -24,7 +24,7 @@ from learner.config import RunConfig, config_hash, flat_params, user_files
 from learner.file_names import USER_FILES
 from learner.tracking.journal import FINAL, Row, mlflow_metrics
 from learner.tracking.local_store import opening
-from learner.tracking.mlflow_views import TAG, packed_view, sweep_views
+from learner.tracking.mlflow_views import TAG, experiment_views, packed_view
 from learner.tracking.redaction import VARIABLE, hide_secrets, public_uri
 from sim_core.checks import ConfigError
 
@@ -96,15 +96,15 @@ class Tracker:
             with opening(uri):
                 self._client = mlflow_client(uri)
                 if experiment is not None:
-                    self._experiment_id = self._experiment(experiment, artifact_root)
+                    self._open_experiment(experiment, artifact_root)
         except (MlflowException, SQLAlchemyError, sqlite3.Error, OSError, ValueError, ImportError) as error:
             reason = hide_secrets(first_line(error), uri)
             raise ConfigError(
                 f"the MLflow store {public_uri(uri)} cannot be opened ({reason}); name another --tracking-uri"
             ) from error
 
-    def _experiment(self, name: str, artifact_root: str | None) -> str:
-        """Id of the experiment, which is made if it is missing.
+    def _open_experiment(self, name: str, artifact_root: str | None) -> None:
+        """Finds the experiment, or makes it, with its views.
 
         Raises:
           ConfigError: it is deleted.
@@ -112,13 +112,15 @@ class Tracker:
         found = self._client.get_experiment_by_name(name)
         if found is None:
             try:
-                return str(self._client.create_experiment(name, artifact_root))
+                self._experiment_id = str(self._client.create_experiment(name, artifact_root))
+                self._set_views()
+                return
             except MlflowException as error:
                 found = self._client.get_experiment_by_name(name)  # another process may have made it meanwhile
                 if found is None or error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
                     raise
         self._refuse_deleted(found)
-        return str(found.experiment_id)
+        self._experiment_id = str(found.experiment_id)
 
     def _refuse_deleted(self, experiment: Experiment) -> None:
         if experiment.lifecycle_stage == LifecycleStage.DELETED:
@@ -275,10 +277,10 @@ class Tracker:
         """Uploads a file to the folder `place` of the artifacts of a run that has ended."""
         self._client.log_artifact(run_id, str(path), place)
 
-    def set_views(self) -> None:
+    def _set_views(self) -> None:
         """Adds the views of `mlflow_views` to the experiment; logs a warning for each that the store refuses."""
         now_ms = int(time.time() * 1000)
-        for key, (name, state) in sweep_views().items():
+        for key, (name, state) in experiment_views().items():
             try:
                 self._client.set_experiment_tag(self._experiment_id, TAG + key, packed_view(name, state, now_ms))
             except MlflowException as error:

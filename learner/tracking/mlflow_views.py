@@ -1,8 +1,8 @@
-"""Saved views of a sweep's experiment in the MLflow UI: the whole grid, and grouped by method, robots and groups.
+"""Saved views of an experiment in the MLflow UI: the whole grid, and by method, robots, groups and share of learners.
 
 MLflow has no API for views. Its UI stores one as a tag of the experiment with compressed JSON, and MLflow's own demo
 (`mlflow.demo.generators.saved_views`) writes such tags with `set_experiment_tag`, as this module does. The format may
-change with MLflow's version, and tests hold it against the installed one. A sweep works without its views.
+change with MLflow's version, and tests hold it against the installed one. Everything works without views.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ TAG = "mlflow.sharedViewState."
 """Prefix of a view's tag; the rest is the view's key."""
 SETUP_PARAMS = ("method", "robots", "groups")
 FAILURES = ("lost", "captured", "collision", "timeout")
+TEAM = ("all_arrive_rate", "segregation")
+"""Metrics of runs in which several robots of a world learn."""
 
 
 def _chart(kind: str, section: str, name: str, **settings: Any) -> dict[str, Any]:
@@ -45,14 +47,14 @@ def _section(uuid: str, name: str) -> dict[str, Any]:
     }
 
 
-def _state(charts: dict[str, list[dict[str, Any]]], group_by: str | None = None) -> dict[str, Any]:
+def _state(charts: dict[str, list[dict[str, Any]]], *group_by: str) -> dict[str, Any]:
     """The state that the UI stores for a view.
 
     Args:
       charts: by name of their section.
-      group_by: the param that runs are grouped by.
+      *group_by: the params that runs are grouped by.
     """
-    keys = [{"mode": "param", "groupByData": group_by}]
+    keys = [{"mode": "param", "groupByData": param} for param in group_by]
     metrics = ["final/success_rate", *(f"final/{failure}_rate" for failure in FAILURES)]
     return {
         "searchFilter": "tags.policy = 'learned'",
@@ -62,7 +64,8 @@ def _state(charts: dict[str, list[dict[str, Any]]], group_by: str | None = None)
         "lifecycleFilter": "Active",
         "datasetsFilter": [],
         "modelVersionFilter": "All Runs",
-        "selectedColumns": [f"params.`{p}`" for p in (*SETUP_PARAMS, "seed")] + [f"metrics.`{m}`" for m in metrics],
+        "selectedColumns": [f"params.`{p}`" for p in (*SETUP_PARAMS, "learners", "seed")]
+        + [f"metrics.`{m}`" for m in metrics],
         "columnOrder": [],
         "columnWidths": {},
         "runsHiddenMode": "SHOWALL",
@@ -79,8 +82,8 @@ def _state(charts: dict[str, list[dict[str, Any]]], group_by: str | None = None)
     }
 
 
-def sweep_views() -> dict[str, tuple[str, dict[str, Any]]]:
-    """The views of a sweep's experiment: (name in the UI, state) by key."""
+def experiment_views() -> dict[str, tuple[str, dict[str, Any]]]:
+    """The views of an experiment: (name in the UI, state) by key."""
 
     def param(key: str) -> dict[str, str]:
         return {"key": key, "type": "PARAM"}
@@ -104,11 +107,26 @@ def sweep_views() -> dict[str, tuple[str, dict[str, Any]]]:
         name: _state({"Grid": [_bar("grid", "final/success_rate")], "Failures": failures, "Curves": curves}, name)
         for name in ("method", "robots", "groups")
     }
+    success_by_share = _chart(
+        "PARALLEL",
+        "success",
+        "learners × method",
+        selectedParams=["learners", "method"],
+        selectedMetrics=["final/success_rate"],
+        showAllRuns=True,
+    )
+    by_learners = {
+        "Success": [success_by_share, _bar("success", "final/success_rate")],
+        "Team": [_bar("team", f"final/{name}") for name in TEAM],
+        "Failures": failures,
+        "Curves": curves,
+    }
     return {
         "grid": ("1 Grid", _state({"Grid": grid, "Curves": curves})),
         "by-method": ("2 By method", by["method"]),
         "by-robots": ("3 By robots", by["robots"]),
         "by-groups": ("4 By groups", by["groups"]),
+        "by-learners": ("5 By learners", _state(by_learners, "learners", "method")),
     }
 
 
@@ -117,7 +135,7 @@ def packed_view(name: str, state: dict[str, Any], time_ms: int) -> str:
 
     Args:
       name: the view's name in the UI.
-      state: one of `sweep_views`.
+      state: one of `experiment_views`.
       time_ms: its creation, in ms since the epoch.
     """
     packed = base64.b64encode(zlib.compress(json.dumps(state).encode())).decode()

@@ -70,9 +70,6 @@ class NoTracker:
     def is_finished(self, run_id: str) -> bool:
         return False
 
-    def set_views(self) -> None:
-        pass
-
 
 def _start(*args: Any, **kwargs: Any) -> NoReturn:
     raise WorkStarted
