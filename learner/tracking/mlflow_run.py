@@ -17,6 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from actors.evaluation.result_table import LEARNED
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.vector_env import EnvShape
 from actors.service.fault_policy import first_line
@@ -147,7 +148,7 @@ class Tracker:
 
         Args:
           config: the run's config.
-          tags: further tags, beside those of the config that a user filters by.
+          tags: further tags, which come before those of the config that a user filters by.
         """
         config_tags = {
             "method": config.world.method_name if config.env.is_swarm else "none",
@@ -156,6 +157,7 @@ class Tracker:
             "learners": config.world.learners if config.env.is_swarm else "none",
             "seed": str(config.seed),
             "engine": config.engine,
+            "policy": LEARNED,
             "config_hash": config_hash(config),
             "mlflow.source.git.commit": self._commit,
         }

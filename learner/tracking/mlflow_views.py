@@ -107,16 +107,8 @@ def experiment_views() -> dict[str, tuple[str, dict[str, Any]]]:
         name: _state({"Grid": [_bar("grid", "final/success_rate")], "Failures": failures, "Curves": curves}, name)
         for name in ("method", "robots", "groups")
     }
-    success_by_share = _chart(
-        "PARALLEL",
-        "success",
-        "learners × method",
-        selectedParams=["learners", "method"],
-        selectedMetrics=["final/success_rate"],
-        showAllRuns=True,
-    )
     by_learners = {
-        "Success": [success_by_share, _bar("success", "final/success_rate")],
+        "Success": [_bar("success", "final/success_rate")],
         "Team": [_bar("team", f"final/{name}") for name in TEAM],
         "Failures": failures,
         "Curves": curves,

@@ -61,14 +61,19 @@ def test_a_packed_view_unpacks_to_itself():
     assert unpack(value) == json.loads(json.dumps(state))
 
 
-def test_an_experiment_gets_the_views_when_it_is_made(tmp_path):
+def test_an_experiment_gets_the_views_when_it_is_made_and_they_show_trainings(tmp_path):
     uri = f"sqlite:///{tmp_path / 'mlflow.db'}"
-    Tracker(uri, "sweep s", str(tmp_path / "artifacts"))
+    tracker = Tracker(uri, "sweep s", str(tmp_path / "artifacts"))
+    tracker.start(RunConfig())
     tags = mlflow.MlflowClient(uri).get_experiment_by_name("sweep s").tags
     assert {key.removeprefix(TAG) for key in tags if key.startswith(TAG)} == experiment_views().keys()
     assert unpack(tags[f"{TAG}by-method"])["groupBy"]["groupByKeys"] == [{"mode": "param", "groupByData": "method"}]
     Tracker(uri, "sweep s", str(tmp_path / "artifacts"))
     assert mlflow.MlflowClient(uri).get_experiment_by_name("sweep s").tags == tags  # it is not made a second time
+    client = mlflow.MlflowClient(uri)
+    experiment = client.get_experiment_by_name("sweep s").experiment_id
+    for _, state in experiment_views().values():
+        assert [run.info.run_id for run in client.search_runs([experiment], state["searchFilter"])] == [tracker.run_id]
 
 
 def test_runs_are_grouped_by_their_share_of_learners_and_show_what_teams_do():
