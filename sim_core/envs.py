@@ -188,6 +188,8 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
         self.render_mode = render_mode
         self.num_envs = int(num_envs)
         self.num_worlds = self.num_envs // per_world
+        self._several, self._num_actions = per_world > 1, self.config.num_actions
+        self._timeout_fails = self.config.timeout_fails
         self.single_observation_space = observation_space(self.config)
         self.single_action_space = gym.spaces.Discrete(self.config.num_actions)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -230,21 +232,25 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
           ValueError: an action is none of the action space, or a world has ended and is not to restart by itself.
         """
         actions = np.asarray(actions)
-        whole = actions.shape == (self.num_envs,) and np.issubdtype(actions.dtype, np.integer)
-        if not whole or actions.min() < 0 or actions.max() >= self.config.num_actions:
-            raise ValueError(f"actions must be {self.num_envs} whole numbers in 0..{self.config.num_actions - 1}")
+        whole = actions.shape == (self.num_envs,) and actions.dtype.kind in "iu"
+        if not whole or actions.astype(np.uint64, copy=False).max() >= self._num_actions:  # a negative one is large
+            raise ValueError(f"actions must be {self.num_envs} whole numbers in 0..{self._num_actions - 1}")
         if self._mode is AutoresetMode.DISABLED and self._ended.any():
             raise ValueError(f"worlds {np.flatnonzero(self._ended).tolist()} have ended; reset them with {RESET_MASK}")
-        restarted, streams = self._ended, self.worlds.state.rng.copy()
+        restarted = self._ended
+        streams = None if self._mode is AutoresetMode.SAME_STEP else self.worlds.state.rng.copy()
         result = self.worlds.step(actions.astype(np.int64, copy=False))
-        if self.config.num_learners > 1:
+        if self._several:
             return self._step_of_robots(result)
-        done = is_done(result.outcome) & ~restarted
-        terminated = is_terminated(result.outcome, self.config.timeout_fails) & done
+        done = is_done(result.outcome)
+        if streams is not None:
+            done &= ~restarted
+        terminated = is_terminated(result.outcome, self._timeout_fails) & done
         observation, reward = result.observation, result.reward.astype(np.float64)
-        infos = _ends(result, done) if done.any() else {}
-        if self._mode is AutoresetMode.SAME_STEP:
-            if done.any():
+        any_done = np.count_nonzero(done)  # which takes a fifth of `done.any()`
+        infos = _ends(result, done) if any_done else {}
+        if streams is None:
+            if any_done:
                 infos = {"final_obs": observation, "_final_obs": done, "final_info": infos, "_final_info": done}
                 observation = self.worlds.reset(done)
             return observation, reward, terminated, done & ~terminated, infos
@@ -256,20 +262,20 @@ class SwarmVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArr
 
     def waiting(self) -> NDArray[np.bool_]:
         """Where a robot's episode has ended and its world has not `[num_envs]`: its next action is not taken."""
-        return is_done(self.worlds.outcome) if self.config.num_learners > 1 else np.zeros(self.num_envs, np.bool_)
+        return is_done(self.worlds.outcome) if self._several else np.zeros(self.num_envs, np.bool_)
 
     def _step_of_robots(
         self, result: StepResult
     ) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """What `step` returns where several robots of a world learn; restarts the worlds that have ended."""
         done = is_done(result.outcome) & result.decided
-        terminated = is_terminated(result.outcome, self.config.timeout_fails) & done
+        terminated = is_terminated(result.outcome, self._timeout_fails) & done
         observation, infos = result.observation, {"decided": result.decided}
-        if done.any():
+        if np.count_nonzero(done):
             infos |= {"final_obs": observation, "_final_obs": done}
             infos |= {"final_info": _ends(result, done), "_final_info": done}  # type: ignore[dict-item]
             ended = self.worlds.ended_worlds()
-            if ended.any():
+            if np.count_nonzero(ended):
                 observation = self.worlds.reset(ended)
         return observation, result.reward.astype(np.float64), terminated, done & ~terminated, infos
 

@@ -4,19 +4,30 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim_core.jit import kernel
+from sim_core.jit import inlined, kernel
+from sim_core.lanes import LANES, any_lane, count_lanes, lane_numbers, load_some
 from sim_core.outcomes import Outcome
 
 _GOAL, _LOST, _CAPTURED = int(Outcome.GOAL), int(Outcome.LOST), int(Outcome.CAPTURED)
 _COLLISION, _RUNNING = int(Outcome.COLLISION), int(Outcome.RUNNING)
 
 
+@inlined
+def _near(first, robot, pos_x, pos_y, distance_sq):
+    """The numbers of the robots from `first` on, a lane each, and which of them are nearer than that to `robot`."""
+    number, count = lane_numbers() + first, pos_x.shape[0] - first
+    dx = load_some(pos_x, first, count) - pos_x[robot]
+    dy = load_some(pos_y, first, count) - pos_y[robot]
+    return number, (dx * dx + dy * dy < distance_sq) & (number < pos_x.shape[0])
+
+
 @kernel
 def collides(robot, pos_x, pos_y, distance_sq):
     """Whether any other robot's centre is nearer than the square root of `distance_sq` (m^2)."""
-    for other in range(pos_x.shape[0]):
-        dx, dy = pos_x[other] - pos_x[robot], pos_y[other] - pos_y[robot]
-        if other != robot and dx * dx + dy * dy < distance_sq:
+    num_robots = pos_x.shape[0]
+    for first in range(0, num_robots, LANES):
+        number, near = _near(first, robot, pos_x, pos_y, distance_sq)
+        if any_lane(near & (number != robot)):
             return True
     return False
 
@@ -24,13 +35,12 @@ def collides(robot, pos_x, pos_y, distance_sq):
 @kernel
 def sensed(robot, begin, end, pos_x, pos_y, range_sq):
     """(own, others): robots of the own group begin..end-1 and of other groups within the sensing range."""
-    own, others = -1, 0  # the robot itself is not counted
-    for other in range(pos_x.shape[0]):
-        dx, dy = pos_x[other] - pos_x[robot], pos_y[other] - pos_y[robot]
-        if dx * dx + dy * dy < range_sq:
-            mate = begin <= other < end
-            own, others = own + mate, others + (not mate)
-    return own, others
+    own, everybody = -1, -1  # the robot itself is not counted
+    for first in range(0, pos_x.shape[0], LANES):
+        number, near = _near(first, robot, pos_x, pos_y, range_sq)
+        own += count_lanes(near & (number >= begin) & (number < end))
+        everybody += count_lanes(near)
+    return own, everybody - own
 
 
 @kernel

@@ -1,7 +1,8 @@
 """SIMD vectors for numba kernels: a vector holds eight numbers, one per lane.
 
 LLVM does not vectorise the branchy loops of ORCA by itself. The extension type `LanesType(element)` makes the vectors
-explicit: it is LLVM's `<8 x element>`, which LLVM lowers to the vector registers of the processor.
+explicit: it is LLVM's `<8 x element>`, which LLVM lowers to the vector registers of the processor. A wide vector, of
+sixteen numbers, fills a register of 512 bits, or two of 256.
 
 Kernels read like scalar code. `+ - * /`, comparisons and `& | ^ ~ >>` work lane by lane; a scalar operand is broadcast
 to all lanes. `select` replaces `if`, and `any_lane` tells whether any lane needs a branch. Elements are float32,
@@ -25,49 +26,49 @@ from numba.extending import intrinsic, lower_builtin, models, register_model, ty
 
 LANES = 8
 """Lanes of a vector: float32 fills one 256-bit register."""
+WIDE = 16
+"""Lanes of a wide vector."""
 
 
 class LanesType(types.Type):
-    """The numba type of a vector of `LANES` numbers of the numba type `element`."""
+    """The numba type of a vector of `lanes` numbers of the numba type `element`."""
 
-    def __init__(self, element: Any) -> None:
-        self.element = element
-        super().__init__(name=f"Lanes({element})")
+    def __init__(self, element: Any, lanes: int = LANES) -> None:
+        self.element, self.lanes = element, lanes
+        super().__init__(name=f"Lanes({element})" if lanes == LANES else f"Lanes({element}, {lanes})")
 
 
 @register_model(LanesType)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: LanesType) -> None:
         element = dmm.lookup(fe_type.element).get_value_type()
-        super().__init__(dmm, fe_type, ir.VectorType(element, LANES))
+        super().__init__(dmm, fe_type, ir.VectorType(element, fe_type.lanes))
 
 
-MASK = LanesType(types.boolean)
-
-
-def _splat(builder: Any, value: Any) -> Any:
-    vector = ir.VectorType(value.type, LANES)
+def _splat(builder: Any, value: Any, lanes: int = LANES) -> Any:
+    vector = ir.VectorType(value.type, lanes)
     first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-    order = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    order = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
     return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), order)
 
 
-def _broadcast(context: Any, builder: Any, value: Any, numba_type: Any, element: Any) -> Any:
-    """Returns `value`, of type `numba_type`, as a vector of `element`; a scalar is repeated in every lane."""
+def _broadcast(context: Any, builder: Any, value: Any, numba_type: Any, vector: LanesType) -> Any:
+    """Returns `value`, of type `numba_type`, as a vector of type `vector`; a scalar is repeated in every lane."""
     if isinstance(numba_type, LanesType):
         return value
-    return _splat(builder, context.cast(builder, value, numba_type, element))
+    return _splat(builder, context.cast(builder, value, numba_type, vector.element), vector.lanes)
 
 
-def _common_element(*arguments: Any) -> Any:
-    """The element type of the vectors among the arguments; None if they differ or a scalar does not fit it."""
-    elements = {argument.element for argument in arguments if isinstance(argument, LanesType)}
+def _common_vector(*arguments: Any) -> Any:
+    """The type of the vectors among the arguments; None if they differ or a scalar does not fit it."""
+    vectors = {argument for argument in arguments if isinstance(argument, LanesType)}
     scalars = [argument for argument in arguments if not isinstance(argument, LanesType)]
-    if len(elements) != 1 or not all(isinstance(scalar, types.Number) for scalar in scalars):
+    if len(vectors) != 1 or not all(isinstance(scalar, types.Number) for scalar in scalars):
         return None
-    if isinstance(next(iter(elements)), types.Integer) and any(isinstance(scalar, types.Float) for scalar in scalars):
+    vector = vectors.pop()
+    if isinstance(vector.element, types.Integer) and any(isinstance(scalar, types.Float) for scalar in scalars):
         return None  # a cast would truncate the scalar
-    return elements.pop()
+    return vector
 
 
 def _is_float(element: Any) -> bool:
@@ -84,17 +85,17 @@ def _binary(operation: Any, emit: Callable[[Any, Any, Any, Any], Any], compares:
     @type_callable(operation)
     def typed(context: Any) -> Any:
         def typer(a: Any, b: Any) -> Any:
-            element = _common_element(a, b)
-            if element is None:
+            vector = _common_vector(a, b)
+            if vector is None:
                 return None
-            return MASK if compares else LanesType(element)
+            return LanesType(types.boolean, vector.lanes) if compares else vector
 
         return typer
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        element = _common_element(*sig.args)
-        a, b = (_broadcast(context, builder, v, t, element) for v, t in zip(args, sig.args, strict=True))
-        return emit(builder, element, a, b)
+        vector = _common_vector(*sig.args)
+        a, b = (_broadcast(context, builder, v, t, vector) for v, t in zip(args, sig.args, strict=True))
+        return emit(builder, vector.element, a, b)
 
     for left, right in ((LanesType, LanesType), (LanesType, types.Number), (types.Number, LanesType)):
         lower_builtin(operation, left, right)(lower)
@@ -170,7 +171,7 @@ def splat(typingctx: Any, value: Any) -> Any:
     element = types.int32 if isinstance(value, types.Integer) else types.unliteral(value)
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _broadcast(context, builder, args[0], sig.args[0], element)
+        return _broadcast(context, builder, args[0], sig.args[0], sig.return_type)
 
     return LanesType(element)(value), lower
 
@@ -178,11 +179,10 @@ def splat(typingctx: Any, value: Any) -> Any:
 @intrinsic
 def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
     """Per lane, a where `mask` is set, else b. One of a and b may be a scalar. Both are always computed."""
-    element = _common_element(a, b)
-    result = LanesType(element)
+    result = _common_vector(a, b)
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pair = (_broadcast(context, builder, v, t, element) for v, t in zip(args[1:], sig.args[1:], strict=True))
+        pair = (_broadcast(context, builder, v, t, result) for v, t in zip(args[1:], sig.args[1:], strict=True))
         return builder.select(args[0], *pair)
 
     return result(mask, a, b), lower
@@ -268,6 +268,17 @@ def extract_lane(typingctx: Any, vector: Any, i: Any) -> Any:
     return vector.element(vector, i), lower
 
 
+def _count_lanes(builder: Any, mask: Any, lanes: int) -> Any:
+    return builder.zext(builder.ctpop(builder.bitcast(mask, ir.IntType(lanes))), ir.IntType(64))
+
+
+@intrinsic
+def count_lanes(typingctx: Any, mask: Any) -> Any:
+    """In how many lanes a mask is set."""
+    lanes = mask.lanes
+    return types.intp(mask), lambda context, builder, sig, args: _count_lanes(builder, args[0], lanes)
+
+
 @intrinsic
 def any_lane(typingctx: Any, mask: Any) -> Any:
     """Whether a mask is set in any lane."""
@@ -292,33 +303,92 @@ def _vector_pointer(context: Any, builder: Any, array: Any, value: Any, element_
     return builder.bitcast(pointer, ir.VectorType(item, lanes).as_pointer()), array.dtype.bitwidth // 8
 
 
+def _reads(lanes: int) -> Any:
+    """The typing and lowering of a load of vectors of so many lanes."""
+
+    def typed(typingctx: Any, array: Any, i: Any) -> Any:
+        if array.layout != "C":
+            return None
+
+        def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            size = ir.Constant(ir.IntType(64), lanes)
+            start = builder.mul(context.cast(builder, args[1], sig.args[1], types.intp), size)
+            pointer, align = _vector_pointer(context, builder, sig.args[0], args[0], start, lanes)
+            return builder.load(pointer, align=align)
+
+        return LanesType(array.dtype, lanes)(array, i), lower
+
+    return typed
+
+
+def _writes(lanes: int) -> Any:
+    """The typing and lowering of a store of vectors of so many lanes."""
+
+    def typed(typingctx: Any, array: Any, i: Any, value: Any) -> Any:
+        if array.layout != "C":
+            return None
+
+        def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            size = ir.Constant(ir.IntType(64), lanes)
+            start = builder.mul(context.cast(builder, args[1], sig.args[1], types.intp), size)
+            pointer, align = _vector_pointer(context, builder, sig.args[0], args[0], start, lanes)
+            builder.store(args[2], pointer, align=align)
+            return context.get_dummy_value()
+
+        return types.void(array, i, value), lower
+
+    return typed
+
+
 @intrinsic
 def load(typingctx: Any, array: Any, i: Any) -> Any:
     """Vector i of a C-contiguous array."""
-    if array.layout != "C":
-        return None
-
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        start = builder.mul(context.cast(builder, args[1], sig.args[1], types.intp), ir.Constant(ir.IntType(64), LANES))
-        pointer, align = _vector_pointer(context, builder, sig.args[0], args[0], start, LANES)
-        return builder.load(pointer, align=align)
-
-    return LanesType(array.dtype)(array, i), lower
+    return _reads(LANES)(typingctx, array, i)
 
 
 @intrinsic
 def store(typingctx: Any, array: Any, i: Any, value: Any) -> Any:
     """Writes `value` to vector i of a C-contiguous array."""
-    if array.layout != "C":
-        return None
+    return _writes(LANES)(typingctx, array, i, value)
+
+
+@intrinsic
+def load_wide(typingctx: Any, array: Any, i: Any) -> Any:
+    """Wide vector i of a C-contiguous array."""
+    return _reads(WIDE)(typingctx, array, i)
+
+
+@intrinsic
+def store_wide(typingctx: Any, array: Any, i: Any, value: Any) -> Any:
+    """Writes `value` to wide vector i of a C-contiguous array."""
+    return _writes(WIDE)(typingctx, array, i, value)
+
+
+@intrinsic
+def store_numbers(typingctx: Any, array: Any, first: Any, mask: Any, number: Any) -> Any:
+    """Writes `number` + i for every lane i that `mask` is set in, one after the other, from element `first` on.
+
+    `array` is of int32. As many elements are written as there are lanes; those after the last number hold anything.
+
+    Returns:
+      How many numbers there are.
+    """
+    lanes = mask.lanes
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        start = builder.mul(context.cast(builder, args[1], sig.args[1], types.intp), ir.Constant(ir.IntType(64), LANES))
-        pointer, align = _vector_pointer(context, builder, sig.args[0], args[0], start, LANES)
-        builder.store(args[2], pointer, align=align)
-        return context.get_dummy_value()
+        start = context.cast(builder, args[1], sig.args[1], types.intp)
+        pointer, align = _vector_pointer(context, builder, sig.args[0], args[0], start, lanes)
+        vector = ir.VectorType(ir.IntType(32), lanes)
+        base = _splat(builder, context.cast(builder, args[3], sig.args[3], types.int32), lanes)
+        numbers = builder.add(base, ir.Constant(vector, list(range(lanes))))
+        name = f"llvm.experimental.vector.compress.v{lanes}i32"
+        function_type = ir.FunctionType(vector, [vector, args[2].type, vector])
+        compress = cgutils.get_or_insert_function(builder.module, function_type, name)
+        chosen = builder.call(compress, [numbers, args[2], ir.Constant(vector, ir.Undefined)])
+        builder.store(chosen, pointer, align=align)
+        return _count_lanes(builder, args[2], lanes)
 
-    return types.void(array, i, value), lower
+    return types.intp(array, first, mask, number), lower
 
 
 def _first_lanes(context: Any, builder: Any, count: Any, count_type: Any) -> Any:

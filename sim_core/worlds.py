@@ -88,7 +88,8 @@ class WorldBatch:
     def __init__(self, config: WorldConfig, num_worlds: int) -> None:
         self.config = config
         self.num_worlds = num_worlds
-        self.num_rows = num_rows = num_worlds * config.num_learners
+        self._per_world = config.num_learners
+        self.num_rows = num_rows = num_worlds * self._per_world
         self.method = make_method(config)
         self._advance, self._end_step, self._reset_episode = map(StateKernel, (advance, end_step, reset_episode))
         self._draw_learners, self._leave_worlds = StateKernel(draw_learners), StateKernel(leave_worlds)
@@ -98,7 +99,7 @@ class WorldBatch:
         self.swarm = packed(swarm_params(config, np.float32))
         self.scene = make_scene(config)
         self._counts = counts_of(config)
-        self._several = config.num_learners > 1
+        self._several = self._per_world > 1
         scene_learner = np.zeros(num_worlds, np.int32) if self._several else self.state.learner
         self._scene_state = self.state._replace(learner=scene_learner)
         impaired, shielded = config.senses_badly or config.drives_badly, config.shield == "orca"
@@ -164,7 +165,7 @@ class WorldBatch:
 
     def rows_of(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """The rows `[num_rows]` of the worlds where `mask` `[num_worlds]` is set."""
-        return np.repeat(mask, self.config.num_learners) if self._several else mask
+        return np.repeat(mask, self._per_world) if self._several else mask
 
     def ended_worlds(self) -> NDArray[np.bool_]:
         """The worlds `[num_worlds]` whose learning robots' episodes have all ended."""
@@ -284,7 +285,7 @@ class WorldBatch:
         """The velocities `[2, num_rows]` (m/s) that FL-ORCA has for the learning robots by what they sense."""
         state, rows = WorldState(*(array.copy() for array in self.sensed)), np.arange(self.num_rows)
         has_view = self._view is not None
-        world = rows if has_view else rows // self.config.num_learners
+        world = rows if has_view else rows // self._per_world
         if has_view or not self._several:
             unknown = np.isnan(state.pos_x)
             for position in (state.pos_x, state.pos_y):

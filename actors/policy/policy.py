@@ -7,23 +7,21 @@ only acts has to import. A test checks that both compute the same function.
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.policy.acting_kernels import acting_layer, acting_tile, action_values, best_actions
 from actors.policy.mlp_kernels import (
     Floats,
     Layers,
     RowEncoder,
-    best_action,
     encode_rows,
-    forward,
     make_row_encoder,
-    make_workspace,
     use_one_blas_thread,
 )
-from sim_core.jit import kernel
+from sim_core.jit import StateKernel, kernel
 
 
 class WeightsSnapshot(NamedTuple):
@@ -56,67 +54,88 @@ def blank_weights(
 class Policy:
     """The compiled policy of a weights snapshot.
 
-    The workspace is kept between calls, since allocating it takes as long as filling it; smaller batches take a part.
+    A plain network remembers the last observation, action and value of every row of a batch, and computes those rows
+    whose observation has changed: M_sensor's counts are often those of the decision before. What it says of an
+    observation depends on no other one, so this changes nothing. A pooled network is computed by BLAS, whose sums may
+    depend on the batch: it computes all rows that decide.
 
     Args:
       weights: the snapshot to act with.
     """
 
     def __init__(self, weights: WeightsSnapshot) -> None:
-        use_one_blas_thread()
         self.weights = weights
-        copies = [array.copy() for array in weights.arrays]  # arrays from Ray are read-only: another numba type
         shared = 4 if weights.row_size else 0  # arrays of the two layers that all rows share
-        self._shared = Layers(tuple(copies[:shared:2]), tuple(copies[1:shared:2]))
-        self._layers = Layers(tuple(copies[shared::2]), tuple(copies[shared + 1 :: 2]))
-        self._room = self._workspace = make_workspace(0, self._layers)
-        self._encoder: RowEncoder | None = None
+        arrays = weights.arrays[shared:]
+        self._num_actions = len(arrays[-1])
+        self._layers = tuple(acting_layer(*pair) for pair in zip(arrays[::2], arrays[1::2], strict=True))
+        self._tile = acting_tile(self._layers, self._num_actions)
+        self._encoder = _Encoder(weights) if weights.row_size else None
+        self._known: NDArray[Any] = np.zeros((0, 0))
+        self._all, self._action, self._value = np.ones(0, np.bool_), np.zeros(0, np.int64), np.zeros(0, np.float32)
 
     def values(self, observation: NDArray[np.generic]) -> NDArray[np.float32]:
         """Action values `[batch, actions]` float32 of observations `[batch, *shape]`."""
-        self._load(observation)
-        _values(self._layers, self._workspace)
-        return self._workspace[-1].copy()
+        inputs = np.ascontiguousarray(observation.reshape(len(observation), -1), np.float32)
+        if self._encoder is not None:
+            inputs = self._encoder(inputs)
+        out = np.empty((len(inputs), self._num_actions), np.float32)
+        action_values(self._layers, self._tile, inputs, out)
+        return out
 
-    def greedy(self, observation: NDArray[np.generic]) -> NDArray[np.int64]:
-        """Greedy actions `[batch]` for observations `[batch, *shape]`; the lowest index among equals."""
-        self._load(observation)
-        actions = np.empty(len(observation), np.int64)
-        _greedy(self._layers, self._workspace, actions)
-        return actions
+    def greedy(self, observation: NDArray[np.generic], decides: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
+        """Greedy actions `[batch]` for observations `[batch, *shape]`; the lowest index among equals.
+
+        Where `decides` `[batch]` is not set there is no decision: action 0.
+        """
+        batch = len(observation)
+        flat = np.ascontiguousarray(observation.reshape(batch, -1))
+        if flat.shape != self._known.shape or flat.dtype != self._known.dtype:
+            self._forget(flat)
+        if self._encoder is None:
+            mask = self._all if decides is None else decides
+            self._best_actions(self._layers, self._tile, flat, self._known, mask, self._action, self._value)
+        else:
+            rows = slice(None) if decides is None else np.flatnonzero(decides)
+            values = self.values(flat[rows])
+            self._action[rows], self._value[rows] = values.argmax(axis=1), values.max(axis=1)
+        return self._action.copy() if decides is None else np.where(decides, self._action, 0)
 
     def highest_values(self) -> NDArray[np.float32]:
-        """The highest action value `[batch]` of each observation of the last call."""
-        highest: NDArray[np.float32] = self._workspace[-1].max(axis=1)
-        return highest
+        """The highest action value `[batch]` of each observation of the last call of `greedy`."""
+        return self._value.copy()
 
-    def _load(self, observation: NDArray[np.generic]) -> None:
-        count = len(observation)
-        if len(self._room[0]) < count:
-            self._room, self._encoder = make_workspace(count, self._layers), None
-        self._workspace = tuple(array[:count] for array in self._room)
-        if not self.weights.row_size:
-            self._workspace[0][...] = observation.reshape(count, -1)
-            return
-        rows = np.ascontiguousarray(observation.reshape(count, -1), np.float32)
+    def _forget(self, flat: NDArray[Any]) -> None:
+        """Begins with batches `[batch, size]` of another size or dtype: all that is known is what zeros lead to."""
+        batch = len(flat)
+        self._all, self._best_actions = np.ones(batch, np.bool_), StateKernel(best_actions)
+        self._action, self._value = np.zeros(batch, np.int64), np.zeros(batch, np.float32)
+        self._known = np.zeros_like(flat)
         if self._encoder is None:
-            most = len(self._room[0])
-            self._encoder = make_row_encoder(most, rows.shape[1] // self.weights.row_size, self._shared)
-        _encode(rows, self._shared, self._encoder, self._workspace[0])
+            of_zeros = self.values(np.zeros((1, flat.shape[1]), np.float32))[0]
+            self._action[:], self._value[:] = of_zeros.argmax(), of_zeros.max()
+
+
+class _Encoder:
+    """The shared layers of a pooled network. Their memory is kept, since allocating it takes as long as filling it."""
+
+    def __init__(self, weights: WeightsSnapshot) -> None:
+        use_one_blas_thread()
+        copies = [array.copy() for array in weights.arrays[:4]]  # arrays from Ray are read-only: another numba type
+        self._layers = Layers(tuple(copies[::2]), tuple(copies[1::2]))
+        self._row_size, self._room = weights.row_size, 0
+        self._memory: RowEncoder | None = None
+
+    def __call__(self, observation: Floats) -> Floats:
+        """The own row, then the maximum over the encoded others `[batch, row_size + width]`."""
+        count, size = observation.shape
+        if self._memory is None or count > self._room:
+            self._memory, self._room = make_row_encoder(count, size // self._row_size, self._layers), count
+        out = np.empty((count, self._row_size + len(self._layers.biases[1])), np.float32)
+        _encode(observation, self._layers, self._memory, out)
+        return out
 
 
 @kernel
 def _encode(observations: Floats, shared: Layers, encoder: RowEncoder, out: Floats) -> None:
     encode_rows(observations, 0, shared, encoder, out)
-
-
-@kernel
-def _values(layers: Layers, workspace: tuple[Floats, ...]) -> None:
-    forward(layers, workspace)
-
-
-@kernel
-def _greedy(layers: Layers, workspace: tuple[Floats, ...], actions: NDArray[np.int64]) -> None:
-    forward(layers, workspace)
-    for row in range(len(actions)):
-        actions[row] = best_action(workspace[-1], row)

@@ -58,8 +58,3 @@ def draw_random_actions(
     """
     random = rng.integers(num_actions, size=shape)
     return np.where(rng.random(shape) < rate, random, GREEDY)
-
-
-def explore(greedy: NDArray[np.int64], random_actions: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Actions `[batch]`: those of `random_actions` `[batch]`, and those of `greedy` `[batch]` where they are GREEDY."""
-    return np.where(random_actions == GREEDY, greedy, random_actions)

@@ -18,7 +18,8 @@ class Steps(NamedTuple):
 
     observation, action: the observation and the action taken in it.
     reward: float64.
-    next_observation: observation after the step; an episode's last one where `done`.
+    next_observation: observation after the step; an episode's last one where `done`. It is read there and in the last
+      step alone: elsewhere it is the next step's observation.
     terminated: where the task terminated.
     done: where the episode ended, terminated or truncated.
     decided: where there was a step; a learning robot whose episode has ended makes none until its world restarts.
@@ -71,6 +72,19 @@ class NStepAssembler:
         self._powers = discount ** np.arange(n_step + 1)
         self._kept = empty_steps(n_step - 1, num_envs, dtype)
         self._pending = np.zeros((n_step - 1, num_envs), np.bool_)
+        self._window, self._room = empty_steps(n_step - 1, num_envs, dtype), empty_steps(0, num_envs, dtype)
+
+    def room(self, steps: int) -> Steps:
+        """Memory for the next `steps` env steps, to be filled and pushed: other Steps are copied when they are pushed.
+
+        It is kept from block to block, since memory that is new takes longer to write to.
+        """
+        if len(self._room.done) != steps:
+            kept = len(self._pending)
+            self._window = empty_steps(kept + steps, self._pending.shape[1], self._dtype)
+            columns: list[NDArray[Any]] = [array[kept:] for array in self._window]
+            self._room = Steps(*columns)
+        return self._room
 
     def push(self, steps: Steps) -> Packed:
         """Takes the next env steps and returns the transitions that they complete, oldest first.
@@ -100,9 +114,13 @@ class NStepAssembler:
         return Packed(rows[:num_rows], frames[:num_frames].copy()), pending
 
     def _with_kept(self, steps: Steps) -> Steps:
-        if not len(self._pending):
-            return steps
-        return Steps(*(np.concatenate(pair) for pair in _pairs(self._kept, steps)))
+        room = self.room(len(steps.done))
+        if steps is not room:
+            for own, array in _pairs(room, steps):
+                own[...] = array
+        for array, kept in _pairs(self._window, self._kept):
+            array[: len(kept)] = kept
+        return self._window
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Copies of everything that a checkpoint needs."""
@@ -200,7 +218,10 @@ def _link(steps: _Columns, rows: Fields, frames: NDArray[np.uint8], index: _RowI
                 rows.next_row[row] = after - row
             else:
                 rows.next_row[row] = -count
-                copy_bytes(steps.next_observation[last, env], frames[count], 0)
+                if last + 1 < total and not steps.done[last, env]:
+                    copy_bytes(steps.observation[last + 1, env], frames[count], 0)
+                else:
+                    copy_bytes(steps.next_observation[last, env], frames[count], 0)
                 count += 1
     return count
 

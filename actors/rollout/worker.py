@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from actors.policy.policy import Policy, WeightsSnapshot
 from actors.rollout.env_spec import EnvSpec
-from actors.rollout.exploration import draw_random_actions, explore
+from actors.rollout.exploration import draw_random_actions
 from actors.rollout.joined_env import JoinedVectorEnv
-from actors.rollout.nstep import NStepAssembler, Steps, empty_steps
+from actors.rollout.nstep import NStepAssembler
+from actors.rollout.step_kernels import StepLog, explore, record_step
 from actors.rollout.vector_env import final_observations, make_vector_env, num_worlds_of, reset_seeded, spaces_of
 from actors.service.messages import (
     NO_OUTCOME,
@@ -24,6 +25,7 @@ from actors.service.messages import (
 from actors.service.packing import packed_dtype
 from sim_core.checks import ConfigError
 from sim_core.envs import SwarmVectorEnv
+from sim_core.jit import StateKernel
 
 
 class RolloutSettings(NamedTuple):
@@ -84,6 +86,11 @@ class RolloutWorker:
         env_seeds, policy_seed = seeds.spawn(2)
         self._rng = np.random.Generator(np.random.PCG64(policy_seed))
         self._nstep = NStepAssembler(self._dtype, num_envs, settings.n_step, settings.discount)
+        self._steps = steps = self._nstep.room(settings.steps_per_block)
+        size = steps.done.shape
+        self._ended = ended = EpisodeStats(np.zeros(size, np.int8), np.zeros(size, np.int32), np.zeros(size))
+        written = steps.action, steps.reward, steps.terminated, steps.done
+        self._log, self._record = StepLog(*written, ended.length_steps, ended.episode_return), StateKernel(record_step)
         self._length = np.zeros(num_envs, np.int32)
         self._return = np.zeros(num_envs, np.float64)
         words = env_seeds.generate_state(num_worlds_of(self._env)) // 2  # Gymnasium takes 31 bits
@@ -108,13 +115,10 @@ class RolloutWorker:
         """
         if self._policy is None:
             raise RuntimeError("a rollout worker needs weights before it collects")
-        count = self._settings.steps_per_block
-        steps = empty_steps(count, self._num_envs, self._dtype)
-        shape = (count, self._num_envs)
-        random_actions = draw_random_actions(shape, epsilon, self._num_actions, self._rng)
-        ended = EpisodeStats(np.zeros(shape, np.int8), np.zeros(shape, np.int32), np.zeros(shape))
-        for i in range(count):
-            self._step(self._policy, random_actions[i], steps, ended, i)
+        steps = self._steps
+        random_actions = draw_random_actions(steps.done.shape, epsilon, self._num_actions, self._rng)
+        for i in range(len(random_actions)):
+            self._step(self._policy, random_actions[i], i)
         packed = self._nstep.push(steps)
         if not np.isfinite(packed.rows["reward"]).all():
             raise ConfigError(self._too_large(packed.rows["reward"]))
@@ -132,7 +136,7 @@ class RolloutWorker:
             made=self._made,
         )
         self._sequence += 1
-        return TransitionBlock(header, packed, select_stats(ended, steps.done))
+        return TransitionBlock(header, packed, select_stats(self._ended, steps.done))
 
     def _too_large(self, reward: NDArray[np.float32]) -> str:
         env, bad = self._settings.env, reward[~np.isfinite(reward)][0]
@@ -140,36 +144,36 @@ class RolloutWorker:
         what = f"{self._settings.n_step}-step return of {bad}, which float32 does not hold"
         return f"{cause} gives a {what}; scale its rewards down"
 
-    def _step(
-        self, policy: Policy, random_actions: NDArray[np.int64], steps: Steps, ended: EpisodeStats, i: int
-    ) -> None:
-        """Steps every environment once; writes row i of `steps`, and of `ended` where an episode ends."""
+    def _step(self, policy: Policy, random_actions: NDArray[np.int64], i: int) -> None:
+        """Steps every environment once; writes step i of the block, and of its episodes where one ends.
+
+        Next observations are written in the last step, and where an episode ends.
+        """
+        steps = self._steps
         action = explore(self._greedy(policy), random_actions)
         observation, reward, terminated, truncated, infos = self._env.step(action)
-        done = terminated | truncated
-        steps.observation[i], steps.action[i], steps.reward[i] = self._observation, action, reward
-        steps.next_observation[i] = final_observations(observation, done, infos)
-        steps.terminated[i], steps.done[i] = terminated, done
-        steps.decided[i] = infos.get("decided", True)
+        told = action, reward, terminated, truncated
+        any_ended = self._record(self._log, i, *told, self._length, self._return)
+        steps.observation[i] = self._observation
+        if self._may_wait:
+            steps.decided[i] = infos.get("decided", True)
         self._observation = observation
-        self._length += 1
-        self._return += reward
-        if done.any():
+        done = steps.done[i]
+        if i + 1 == len(steps.done):
+            steps.next_observation[i] = final_observations(observation, done, infos)
+        if any_ended:
+            steps.next_observation[i, done] = infos["final_obs"][done]
             final = infos.get("final_info", {})
-            ended.outcome[i] = final.get("outcome", NO_OUTCOME)
-            ended.length_steps[i] = final["episode_length"] if self._settings.env.is_swarm else self._length
-            ended.episode_return[i] = self._return
-            self._length[done] = 0
-            self._return[done] = 0.0
+            self._ended.outcome[i] = final.get("outcome", NO_OUTCOME)
+            if self._settings.env.is_swarm:
+                self._ended.length_steps[i] = final["episode_length"]
 
     def _greedy(self, policy: Policy) -> NDArray[np.int64]:
         """The policy's actions `[num_envs]`; 0 for robots that wait for their world's end, which take none."""
         if not self._may_wait:
             return policy.greedy(self._observation)
         assert isinstance(self._env, SwarmVectorEnv | JoinedVectorEnv)
-        decides, action = ~self._env.waiting(), np.zeros(self._num_envs, np.int64)
-        action[decides] = policy.greedy(self._observation[decides])
-        return action
+        return policy.greedy(self._observation, ~self._env.waiting())
 
     def close(self) -> None:
         """Closes the environments."""

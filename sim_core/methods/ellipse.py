@@ -106,10 +106,3 @@ def in_ellipse(x, y, a, b, x_c, y_c, theta):
 def left_out_of(learner, p):
     """The robot that does not count in an ellipse: the learning robot, or NOBODY."""
     return NOBODY if p.counts_learner else learner
-
-
-@kernel
-def in_own_ellipse(learner, begin, end, pos_x, pos_y, p):
-    """Whether the learning robot lies in the ellipse of its group, robots begin..end-1. `p`: EllipseParams."""
-    a, b, x_c, y_c, theta = group_ellipse(begin, end, pos_x, pos_y, left_out_of(learner, p), p)
-    return in_ellipse(pos_x[learner], pos_y[learner], a, b, x_c, y_c, theta)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from sim_core.checks import require
 from sim_core.config import WorldConfig
 from sim_core.episode_end import collision_or_goal, lost_or_captured, sensed
-from sim_core.jit import StateKernel, kernel
+from sim_core.jit import StateKernel, inlined, kernel
 from sim_core.methods.apf import FieldParams, field_of, field_params
 from sim_core.methods.base import EpisodeParams, Method, Preset, Rule, episode_params
 from sim_core.methods.ellipse import (
@@ -30,7 +30,7 @@ from sim_core.methods.ellipse import (
     ellipse_params,
     group_centre,
     group_ellipse,
-    in_own_ellipse,
+    in_ellipse,
     left_out_of,
 )
 from sim_core.methods.headings import heading_velocities
@@ -87,12 +87,37 @@ def _order_groups(world, learner, state, order, distance_sq, p):
         order[at] = group
 
 
+@inlined
+def _ellipse_of(group, world, learner, state, ellipses, p):
+    """A group's (a, b, x_c, y_c, theta) in metres and radians, as a learning robot has it.
+
+    It is the same for all of a world, but for the learning robot itself where that does not count.
+
+    Args:
+      group: the group.
+      world: its world.
+      learner: the learning robot.
+      state: WorldState.
+      ellipses: `[groups, 6]`, the last ones found that are the same for all, each with its world.
+      p: EllipseMethodParams.
+    """
+    pos_x, pos_y = state.pos_x[world], state.pos_y[world]
+    begin, end = state.group_begin[group], state.group_begin[group + 1]
+    left_out, known = left_out_of(learner, p.ellipse), ellipses[group]
+    if begin <= left_out < end:
+        return group_ellipse(begin, end, pos_x, pos_y, left_out, p.ellipse)
+    if known[5] != world:
+        known[0], known[1], known[2], known[3], known[4] = group_ellipse(begin, end, pos_x, pos_y, NOBODY, p.ellipse)
+        known[5] = world
+    return known[0], known[1], known[2], known[3], known[4]
+
+
 @kernel
-def _write_row(group, world, learner, state, out, at, p):
+def _write_row(group, world, learner, state, out, at, ellipses, p):
     """Writes one group's row to `out[at:at + columns]`."""
     pos_x, pos_y = state.pos_x[world], state.pos_y[world]
     begin, end = state.group_begin[group], state.group_begin[group + 1]
-    a, b, x_c, y_c, theta = group_ellipse(begin, end, pos_x, pos_y, left_out_of(learner, p.ellipse), p.ellipse)
+    a, b, x_c, y_c, theta = _ellipse_of(group, world, learner, state, ellipses, p)
     if x_c != x_c:  # none of its robots is sensed: no ellipse, which no half-axis of 0 can be taken for
         a, b, x_c, y_c, theta = 0.0, 0.0, pos_x[learner] + 0.0, pos_y[learner] + 0.0, 0.0
     out[at], out[at + 1] = a * p.ellipse_scale, b * p.ellipse_scale
@@ -110,28 +135,31 @@ def _write_row(group, world, learner, state, out, at, p):
 
 
 @kernel
-def _perceive(state, mask, out, order, distance_sq, params):
+def _perceive(state, mask, out, order, distance_sq, ellipses, params):
     p = params[0]
+    ellipses[:, 5] = -1.0
     for row in range(mask.shape[0]):
         if not mask[row]:
             continue
         world, learner = world_of(state, row), state.learner[row]
         _order_groups(world, learner, state, order, distance_sq, p)
         for place in range(p.groups):
-            _write_row(order[place], world, learner, state, out[row], place * p.columns, p)
+            _write_row(order[place], world, learner, state, out[row], place * p.columns, ellipses, p)
         out[row, p.groups * p.columns :] = np.float32(0)
 
 
 @kernel
-def _outcome(state, mask, out, params):
+def _outcome(state, mask, out, ellipses, params):
     p, e = params[0], params[0].episode
+    ellipses[:, 5] = -1.0
     for row in range(out.shape[0]):
         if not mask[row]:
             continue
         world, learner = world_of(state, row), state.learner[row]
         pos_x, pos_y = state.pos_x[world], state.pos_y[world]
         group, begin, end = own_group(state, row)
-        inside = in_own_ellipse(learner, begin, end, pos_x, pos_y, p.ellipse)
+        a, b, x_c, y_c, theta = _ellipse_of(group, world, learner, state, ellipses, p)
+        inside = in_ellipse(pos_x[learner], pos_y[learner], a, b, x_c, y_c, theta)
         state.outside_steps[row] = 0 if inside else state.outside_steps[row] + 1
         goal_x, goal_y = state.goal_x[world, group], state.goal_y[world, group]
         ended = collision_or_goal(
@@ -228,6 +256,7 @@ class EllipseMethod(Method):
         self.observation_limit = observation_limit(config)
         self._order = np.zeros(config.groups, np.int32)
         self._distance_sq = np.zeros(config.groups, np.float64)
+        self._ellipses = np.zeros((config.groups, 6))
         self._params = packed(
             EllipseMethodParams(
                 ellipse=ellipse_params(config),
@@ -291,11 +320,11 @@ class EllipseMethod(Method):
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.float32]) -> None:
         """4.2.1: the state matrix `[num_rows, rows * row_size]`, row after row."""
-        self._perceive(state, mask, out, self._order, self._distance_sq, self._params)
+        self._perceive(state, mask, out, self._order, self._distance_sq, self._ellipses, self._params)
 
     def outcome(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
         """4.2.1: goal, collision, lost or captured (see `lost_ends_episode`), timeout; counts `outside_steps`."""
-        self._end_of_step(state, mask, out, self._params)
+        self._end_of_step(state, mask, out, self._ellipses, self._params)
 
     def reward(
         self, state: WorldState, mask: NDArray[np.bool_], outcome: NDArray[np.int8], out: NDArray[np.float32]

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from sim_core.checks import require
 from sim_core.config import WorldConfig
-from sim_core.jit import StateKernel, kernel
+from sim_core.jit import StateKernel, inlined, kernel
+from sim_core.lanes import LANES, convert, gather, lane_numbers, load_some, select, splat, store_numbers, store_some
 from sim_core.methods.base import Method, Preset, Rule
 from sim_core.methods.progress import goal_offset
 from sim_core.packed import packed
@@ -81,9 +82,38 @@ def _turn_to_goal(state, out_x, out_y):
         out_x[row], out_y[row] = cos * x - sin * y, sin * x + cos * y
 
 
+@inlined
+def _sectors_of(dx, dy, edges):
+    """The sectors of the directions in the lanes of (dx, dy), as `sector_of` finds them: a vector of int32."""
+    x, y, half = convert(dx, np.float64), convert(dy, np.float64), (edges.shape[0] + 1) // 2
+    upper = y >= 0.0
+    sector = select(upper, half - 1, splat(0))
+    for edge in range(1, edges.shape[0]):
+        passed = edges[edge, 0] * y - edges[edge, 1] * x >= 0.0
+        same_half = upper if edge >= half else ~upper
+        sector = sector + select(passed & same_half, splat(1), splat(0))
+    return sector
+
+
+@inlined
+def _find_sensed(learner, pos_x, pos_y, found, p):
+    """Writes the numbers of the robots within the outer radius, the learning robot not counted; returns how many."""
+    count, num_robots = 0, pos_x.shape[0]
+    for first in range(0, num_robots, LANES):
+        number, left = lane_numbers() + first, num_robots - first
+        dx = load_some(pos_x, first, left) - pos_x[learner]
+        dy = load_some(pos_y, first, left) - pos_y[learner]
+        near = dx * dx + dy * dy < p.outer_sq  # robots that are not sensed are at NaN
+        count += store_numbers(found, count, near & (number != learner) & (number < num_robots), first)
+    for i in range(LANES):
+        found[count + i] = learner
+    return count
+
+
 @kernel
-def _perceive(state, mask, out, edges, params):
+def _perceive(state, mask, out, edges, scratch, params):
     p = params[0]
+    found, cells = scratch[0], scratch[1]
     for row in range(mask.shape[0]):
         if not mask[row]:
             continue
@@ -92,16 +122,17 @@ def _perceive(state, mask, out, edges, params):
         _, group_begin, group_end = own_group(state, row)
         cos, sin = _goal_direction(state, row)
         out[row, :] = 0
-        for other in range(pos_x.shape[0]):
-            dx, dy = pos_x[other] - pos_x[learner], pos_y[other] - pos_y[learner]
-            dist_sq = dx * dx + dy * dy
-            if other == learner or not dist_sq < p.outer_sq:  # not sensed: NaN
-                continue
+        count = _find_sensed(learner, pos_x, pos_y, found, p)
+        for i in range(0, count, LANES):
+            others = load_some(found, i, LANES)
+            dx, dy = gather(pos_x, others) - pos_x[learner], gather(pos_y, others) - pos_y[learner]
+            is_inner = dx * dx + dy * dy < p.inner_sq
             if p.faces_goal:
                 dx, dy = cos * dx + sin * dy, cos * dy - sin * dx
-            cell = sector_of(dx, dy, edges) + (0 if dist_sq < p.inner_sq else p.sectors)
-            step = 1
-            if not group_begin <= other < group_end:
+            store_some(cells, i, LANES, _sectors_of(dx, dy, edges) + select(is_inner, splat(0), p.sectors))
+        for i in range(count):
+            cell, step = cells[i], 1
+            if not group_begin <= found[i] < group_end:
                 cell, step = (cell + 2 * p.sectors, 1) if p.separate else (cell, -1)
             out[row, cell] = min(max(out[row, cell] + step, -COUNT_LIMIT), COUNT_LIMIT)
 
@@ -138,6 +169,7 @@ class SensorMethod(Method):
         self._faces_goal = config.sector_frame == "goal"
         self._perceive, self._turn_to_goal = StateKernel(_perceive), StateKernel(_turn_to_goal)
         self._edges = sector_edges(config.sectors)
+        self._scratch = np.zeros((2, config.num_robots + LANES), np.int32)
         real = np.float32
         self._params = packed(
             SensorParams(
@@ -209,4 +241,4 @@ class SensorMethod(Method):
 
     def perceive(self, state: WorldState, mask: NDArray[np.bool_], out: NDArray[np.int8]) -> None:
         """3.2.1: `[num_rows, 2q]` counts, the inner disc's q first; apart, 2q of the own group, then 2q of others."""
-        self._perceive(state, mask, out, self._edges, self._params)
+        self._perceive(state, mask, out, self._edges, self._scratch, self._params)

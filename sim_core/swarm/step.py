@@ -12,7 +12,7 @@ import numpy as np
 
 from sim_core.config import WorldConfig
 from sim_core.jit import inlined, kernel
-from sim_core.lanes import LANES, any_lane, load, scatter, splat
+from sim_core.lanes import LANES, any_lane, gather, load, scatter, splat
 from sim_core.orca import ORCAParams, build_half_planes, orca_params, orca_velocity
 from sim_core.rng import skip_ahead, uniform_at
 from sim_core.state import learners_per_world
@@ -153,8 +153,27 @@ def run_flocking_passes(tile_index, rows, tile, rng, p):
 
 
 @inlined
-def compute_velocities(tile_index, num_slots, rows, tile, rng, p):
-    """Writes FL-ORCA's new velocities of a tile's robots to `tile.new_vx` and `tile.new_vy`."""
+def mark_given(first_world, num_worlds, state, mask, running, tile, p):
+    """Writes `tile.is_given`: FL-ORCA moves neither running learning robots with a command nor worlds that stay."""
+    per_world, num_robots = learners_per_world(state), p.num_robots
+    tile.is_given[:] = 1
+    for i in range(num_worlds):
+        world = first_world + i
+        if not mask[world]:
+            continue
+        for slot in range(i * num_robots, (i + 1) * num_robots):
+            tile.is_given[slot] = 0
+        for row in range(world * per_world, (world + 1) * per_world):
+            if running[row]:
+                tile.is_given[i * num_robots + state.learner[row]] = 1
+
+
+@inlined
+def compute_velocities(tile_index, num_slots, rows, tile, rng, some_given, p):
+    """Writes FL-ORCA's new velocities of a tile's robots to `tile.new_vx` and `tile.new_vy`.
+
+    With `some_given`, vectors in which `tile.is_given` is set in all lanes are left out.
+    """
     num_robots = p.num_robots
     for row in range(rows):
         find_neighbours(row, tile_index, num_robots, num_slots, tile, p.neighbours)
@@ -164,6 +183,8 @@ def compute_velocities(tile_index, num_slots, rows, tile, rng, p):
         robot, count = load(tile.row_slots, row), tile.neighbour_counts[row]
         start = list_start(row, tile_index, tile, p.neighbours)
         pref_x, pref_y = preferred_velocity(row, tile, p.flock)
+        if some_given and not any_lane(gather(tile.is_given, robot) == 0):
+            continue
         build_half_planes(robot, tile.pos_vel, tile.neighbours, start, count, tile.lines, p.orca)
         x, y = orca_velocity(tile.lines, count, pref_x, pref_y, tile.projected, p.orca)
         scatter(tile.new_vx, robot, x)
@@ -210,7 +231,10 @@ def advance(state, tile, mask, running, command_x, command_y, use_command, param
         if not mask[first_world : first_world + worlds].any():
             continue
         rows = load_tile(first_world, worlds, state, running, tile, p)
-        compute_velocities(first_world // p.worlds_per_tile, worlds * num_robots, rows, tile, state.rng, p)
+        some_given = use_command and learners_per_world(state) > 1
+        if some_given:
+            mark_given(first_world, worlds, state, mask, running, tile, p)
+        compute_velocities(first_world // p.worlds_per_tile, worlds * num_robots, rows, tile, state.rng, some_given, p)
         for i in range(worlds):
             if mask[first_world + i]:
                 world, slot = first_world + i, i * num_robots

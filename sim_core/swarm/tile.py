@@ -41,6 +41,7 @@ class Tile(NamedTuple):
     leaders: `[slots]` int32, the slot of the robot that is followed, -1 for none.
     lines, projected: `[k, 4, 8]`, scratch of the linear programs.
     new_vx, new_vy: `[slots]`, m/s.
+    is_given: `[slots]` int32, 1 where FL-ORCA's velocity is not needed, 0 elsewhere; used where several robots learn.
     machine: `[slots]` int32, the state of FL-ORCA's state machine.
     noise: `[8]`, one draw per lane.
     grid: Grid, used in large worlds.
@@ -65,6 +66,7 @@ class Tile(NamedTuple):
     projected: Any
     new_vx: Any
     new_vy: Any
+    is_given: Any
     machine: Any
     noise: Any
     grid: Grid
@@ -127,6 +129,7 @@ def empty_tile(
         projected=np.zeros((k, 4, LANES), dtype),
         new_vx=np.zeros(slots, dtype),
         new_vy=np.zeros(slots, dtype),
+        is_given=int32_zeros(slots),
         machine=int32_zeros(slots),
         noise=np.zeros(LANES, dtype),
         grid=empty_grid(num_slots),

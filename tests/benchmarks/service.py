@@ -1,6 +1,7 @@
 """Where the time goes: the bare simulator, the rollout worker, the learner, and the whole service over Ray."""
 
 import dataclasses
+import time
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from learner.training.cluster import rollout_settings
 from learner.update.learner import Learner
 from sim_core.config import WorldConfig
 from tests.benchmarks.ray_service import ENDLESS, Point, measured_point
-from tests.benchmarks.timing import rates, ratio, spread
+from tests.benchmarks.timing import rates, ratio, spread, stopwatch, timed_rates
 
 ROUNDS = 5
 SERVICE_S = 20.0
@@ -39,8 +40,8 @@ SAMPLES_PER_INSERT = (2.0, 8.0)
 
 KINDS = (*(Kind(samples, "learner") for samples in SAMPLES_PER_INSERT), Kind(8.0, "actors"))
 
-SETUPS = (((10, 2), 6), ((10, 8), 2), ((25, 8), 1))
-"""Setups whose rollout worker is set beside its bare simulator, and blocks of one measurement."""
+SETUPS = (((10, 2), 1, 6), ((10, 2), 4, 2), ((10, 8), 1, 2), ((25, 8), 1, 1))
+"""Setups whose rollout worker is set beside its bare simulator, simulator steps of a decision, blocks measured."""
 
 
 def simulator_work(config: RunConfig, blocks: int):
@@ -60,11 +61,14 @@ def simulator_work(config: RunConfig, blocks: int):
 
 def worker_work(config: RunConfig, blocks: int):
     worker = RolloutWorker(rollout_settings(config), 0, 0)
-    learner = Learner(config, env_shape(config.env))
-    worker.set_weights(snapshot(learner.online, 0, 0.0))
+    weights = snapshot(Learner(config, env_shape(config.env)).online, 0, 0.0)
 
     def work() -> int:
-        return sum(worker.collect(1.0).header.env_steps for _ in range(blocks))
+        env_steps = 0
+        for _ in range(blocks):
+            worker.set_weights(weights)  # as after every block of a training, which brings new ones
+            env_steps += worker.collect(1.0).header.env_steps
+        return env_steps
 
     return work
 
@@ -85,16 +89,18 @@ def learner_work(config: RunConfig):
 
 
 def rollout_table() -> Table:
-    """The rollout worker of small and large worlds, of the bare simulator of each."""
+    """The rollout worker of small and large worlds, of the bare simulator of each; in CPU time of the process."""
     table = Table(title="rollout worker, M_sensor, one core; rates, median (lowest … highest)")
-    for column in ("setup", "bare simulator, env steps/s", "rollout worker, env steps/s", "of the bare simulator"):
+    columns = ("setup", "steps a decision", "bare simulator, env steps/s", "rollout worker, env steps/s")
+    for column in (*columns, "of the bare simulator"):
         table.add_column(column, justify="right")
-    for (robots, groups), blocks in SETUPS:
-        config = RunConfig(**ENDLESS, world=WorldConfig(robots=robots, groups=groups))
+    for (robots, groups), interval, blocks in SETUPS:
+        config = RunConfig(**ENDLESS, world=WorldConfig(robots=robots, groups=groups, decision_interval_steps=interval))
         works = {"simulator": simulator_work(config, blocks), "worker": worker_work(config, blocks)}
-        found = rates(works, ROUNDS)
+        found = timed_rates({name: stopwatch(work, time.process_time) for name, work in works.items()}, ROUNDS)
         share = ratio(found["worker"], found["simulator"])
-        table.add_row(config.world.setup, *(spread(found[name]).text() for name in works), share.text(2))
+        rates_of = (spread(found[name]).text() for name in works)
+        table.add_row(config.world.setup, str(interval), *rates_of, share.text(2))
     return table
 
 

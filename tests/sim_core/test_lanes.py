@@ -9,14 +9,17 @@ from numba.core.errors import TypingError
 from sim_core.jit import kernel
 from sim_core.lanes import (
     LANES,
+    WIDE,
     any_lane,
     convert,
+    count_lanes,
     extract_lane,
     gather,
     gather_4,
     lane_numbers,
     load,
     load_some,
+    load_wide,
     maximum,
     minimum,
     scatter,
@@ -24,7 +27,9 @@ from sim_core.lanes import (
     splat,
     sqrt,
     store,
+    store_numbers,
     store_some,
+    store_wide,
     view_bits,
 )
 
@@ -323,6 +328,71 @@ def test_some_lanes_are_read_and_written_and_nothing_beyond(dtype, count):
     np.testing.assert_array_equal(lanes, [*source[5 : 5 + most], *[0] * (LANES - most)])
     np.testing.assert_array_equal(target[3 : 3 + most], source[5 : 5 + most])
     assert (np.delete(target, np.s_[3 : 3 + most]) == 77).all()
+
+
+@kernel
+def _wide(a, b, scalar, out):
+    vectors = a.shape[0] // WIDE
+    for i in range(vectors):
+        x, y = load_wide(a, i), load_wide(b, i)
+        results = (x + y, x * y, scalar * x, x - scalar, select(x < y, x, y), select(x == scalar, scalar, y))
+        for k in range(len(results)):
+            store_wide(out, k * vectors + i, results[k])
+
+
+@pytest.mark.parametrize("dtype", REALS)
+def test_wide_vectors(dtype):
+    a, b = np.resize(pairs(dtype), (2, 40 * WIDE))
+    s = dtype(3)
+    with np.errstate(all="ignore"):
+        expected = {
+            "x + y": a + b, "x * y": a * b, "s * x": s * a, "x - s": a - s, "select": np.where(a < b, a, b),
+            "select s else y": np.where(a == s, s, b),
+        }  # fmt: skip
+    out = np.zeros((len(expected), len(a)), dtype)
+    _wide(a, b, s, out)
+    assert_all_same(out, expected)
+
+
+@kernel
+def _numbers(values, out, counts):
+    at = 0
+    for i in range(values.shape[0] // LANES):
+        mask = load(values, i) != 0
+        at += store_numbers(out, at, mask, i * LANES)
+        counts[i] = count_lanes(mask)
+    return at
+
+
+@kernel
+def _wide_numbers(values, out, counts):
+    at = 0
+    for i in range(values.shape[0] // WIDE):
+        mask = load_wide(values, i) != 0
+        at += store_numbers(out, at, mask, i * WIDE)
+        counts[i] = count_lanes(mask)
+    return at
+
+
+@pytest.mark.parametrize(("numbers", "lanes"), [(_numbers, LANES), (_wide_numbers, WIDE)])
+def test_numbers_of_lanes_are_written_one_after_the_other(numbers, lanes):
+    values = (np.random.default_rng(4).random(30 * lanes) < 0.4).astype(np.int32)
+    values[: 2 * lanes], values[2 * lanes : 3 * lanes] = 0, 1  # none, then all
+    out, counts = np.full(31 * lanes, 77, np.int32), np.zeros(30, np.int64)
+    count = numbers(values, out, counts)
+    np.testing.assert_array_equal(out[:count], np.flatnonzero(values))
+    np.testing.assert_array_equal(counts, values.reshape(30, lanes).sum(axis=1))
+    assert (out[count + lanes :] == 77).all()
+
+
+@kernel
+def _mixes_widths(a):
+    store(a, 0, load(a, 0) + load_wide(a, 0))
+
+
+def test_vectors_of_two_sizes_do_not_mix():
+    with pytest.raises(TypingError, match=r"Lanes\(float32, 16\)"):
+        _mixes_widths(np.zeros(WIDE, np.float32))
 
 
 @kernel

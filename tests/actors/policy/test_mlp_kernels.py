@@ -20,7 +20,8 @@ print(json.dumps([before, threads()]))
 """
 POLICY = """
 from actors.policy.policy import Policy, WeightsSnapshot
-Policy(WeightsSnapshot(0, 0.0, (np.zeros((3, 2), np.float32), np.zeros(3, np.float32))))
+shapes = [(4, 2), (4,), (5, 4), (5,), (3, 7), (3,)]  # of a pooled network, which multiplies with BLAS
+Policy(WeightsSnapshot(0, 0.0, tuple(np.zeros(shape, np.float32) for shape in shapes), 2))
 """
 LEARNER = """
 from actors.rollout.vector_env import env_shape

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from actors.rollout.exploration import GREEDY, Exploration, draw_random_actions, epsilon, explore
+from actors.rollout.exploration import GREEDY, Exploration, draw_random_actions, epsilon
+from actors.rollout.step_kernels import explore
 
 SCHEDULE = Exploration("schedule", 1.0, 0.05, 1000, 0.4, 7.0)
 LADDER = SCHEDULE._replace(kind="ladder")

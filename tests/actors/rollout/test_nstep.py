@@ -122,3 +122,17 @@ def test_only_next_observations_without_a_row_become_frames(history, n_step, cut
         expected = [end or (env, t) not in begun for end, (env, t) in zip(ended, reached.tolist(), strict=True)]
         np.testing.assert_array_equal(packed.rows["next_row"] <= 0, expected)
         assert len(packed.frames) == sum(expected)
+
+
+@given(history=histories(), n_step=st.integers(1, 5), block=st.integers(1, 6))
+@settings(max_examples=100, deadline=None)
+def test_steps_that_are_written_to_its_room_give_the_same_rows(history, n_step, block):
+    rewards, ends = history
+    copying, in_place = (NStepAssembler(ROW, rewards.shape[1], n_step, DISCOUNT) for _ in range(2))
+    for begin in range(0, len(rewards), block):
+        steps = steps_of(rewards, ends, range(begin, min(begin + block, len(rewards))))
+        room = in_place.room(len(steps.done))
+        for own, array in zip(room, steps, strict=True):
+            own[...] = array
+        room.next_observation[:-1][~steps.done[:-1]] = np.nan  # which nobody reads
+        np.testing.assert_array_equal(unpack(in_place.push(room), DTYPE), unpack(copying.push(steps), DTYPE))

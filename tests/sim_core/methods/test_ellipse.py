@@ -14,7 +14,7 @@ from sim_core.methods.ellipse import (
     group_covariance,
     group_ellipse,
     in_ellipse,
-    in_own_ellipse,
+    left_out_of,
     principal_axes,
 )
 
@@ -146,7 +146,9 @@ def own(pos, learner, robots, **settings):
     settings = {"method": "out", "robots": robots, "groups": len(pos) // robots, "arena_radius_m": 60.0} | settings
     params = ellipse_params(WorldConfig(**settings))
     begin = learner // robots * robots
-    return in_own_ellipse(learner, begin, begin + robots, *np.ascontiguousarray(np.asarray(pos, REAL).T), params)
+    columns = np.ascontiguousarray(np.asarray(pos, REAL).T)
+    found = group_ellipse(begin, begin + robots, *columns, left_out_of(learner, params), params)
+    return in_ellipse(*columns[:, learner], *found)
 
 
 def test_the_own_group_is_the_learning_robots():
