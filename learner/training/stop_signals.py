@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that stop a run; SIGHUP comes from a terminal that is closed, or a connection that is lost."""
+
+
+AGAIN_S = 0.1
+"""Time after which a process is interrupted again where an interruption came to nothing."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -68,16 +74,36 @@ class StopRequest:
                     signal.signal(number, self.handle)
 
 
+def _sends_again(before: Callable[[sys.UnraisableHookArgs], object]) -> Callable[[sys.UnraisableHookArgs], None]:
+    """A `sys.unraisablehook` that interrupts again where a finaliser or a weak reference's callback was interrupted.
+
+    Python ignores what is raised there, and the signal with it. The request remembers the first signal's number.
+    """
+
+    def hook(unraisable: sys.UnraisableHookArgs) -> None:
+        if isinstance(unraisable.exc_value, Interrupted):
+            again = threading.Timer(AGAIN_S, os.kill, (os.getpid(), signal.SIGINT))
+            again.daemon = True
+            again.start()
+        else:
+            before(unraisable)
+
+    return hook
+
+
 @contextmanager
 def stop_on_signals(*numbers: int) -> Iterator[StopRequest]:
     """Turns signals, by default Ctrl-C and SIGTERM, into a StopRequest; restores the old handlers."""
     numbers = numbers or (signal.SIGINT, signal.SIGTERM)
     request = StopRequest()
     before = {number: signal.getsignal(number) for number in numbers}
+    hook_before = sys.unraisablehook
     request.listen(numbers)
+    sys.unraisablehook = _sends_again(hook_before)
     try:
         yield request
     finally:
+        sys.unraisablehook = hook_before
         if threading.current_thread() is threading.main_thread():
             for number, handler in before.items():
                 signal.signal(number, handler)

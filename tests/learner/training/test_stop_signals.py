@@ -2,6 +2,8 @@
 
 import os
 import signal
+import time
+import weakref
 
 import pytest
 
@@ -30,6 +32,28 @@ def test_a_second_sigterm_still_lets_the_run_save():
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop()
+
+
+class Referred:
+    """May be referred to weakly."""
+
+
+@pytest.mark.parametrize("at_once", [False, True])
+def test_a_signal_in_a_callback_whose_errors_python_ignores_interrupts_all_the_same(at_once):
+    with pytest.raises(Interrupted) as caught, stop_on_signals() as stop, stop.at_once(at_once):
+        if not at_once:
+            os.kill(os.getpid(), signal.SIGTERM)  # a second one interrupts if it is Ctrl-C
+        referred, called = Referred(), []
+
+        def callback(reference):
+            called.append(reference)
+            os.kill(os.getpid(), signal.SIGTERM if at_once else signal.SIGINT)
+
+        reference = weakref.ref(referred, callback)
+        del referred
+        assert called == [reference]
+        time.sleep(60)
+    assert caught.value.signal == signal.SIGTERM
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError, KeyboardInterrupt])
