@@ -110,10 +110,13 @@ class Policy:
         batch = len(flat)
         self._all, self._best_actions = np.ones(batch, np.bool_), StateKernel(best_actions)
         self._action, self._value = np.zeros(batch, np.int64), np.zeros(batch, np.float32)
-        self._known = np.zeros_like(flat)
-        if self._encoder is None:
-            of_zeros = self.values(np.zeros((1, flat.shape[1]), np.float32))[0]
-            self._action[:], self._value[:] = of_zeros.argmax(), of_zeros.max()
+        self._known = np.ones_like(flat)
+        if self._encoder is None and batch:
+            first = np.arange(batch) == 0
+            zeros = np.zeros_like(flat)
+            self._best_actions(self._layers, self._tile, zeros, self._known, first, self._action, self._value)
+            self._action[:], self._value[:] = self._action[0], self._value[0]
+        self._known[:] = 0
 
 
 class _Encoder:
