@@ -449,6 +449,7 @@ UNCOUNTED = {
     "kinematics": "holonomic",
     "turn_rate_limit_deg_s": 180.0,
     "acceleration_limit_m_s2": 2.0,
+    "track_steps": 0,
 }
 """Settings that hashes leave out at these values: runs from before there were such settings keep their hashes."""
 

@@ -472,4 +472,4 @@ class Senses:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays that steps change, by name, each with the worlds along its first axis."""
         arrays = self._known | self._memory._asdict() | {"commands": self._commands}
-        return {f"senses_{name}": array for name, array in arrays.items() if name != "known"}
+        return {f"senses_{name}": array for name, array in arrays.items() if name != "known" and array.size}

@@ -58,13 +58,13 @@ def test_metrics_of_an_outage_of_mlflow_arrive_later_and_once(server, tmp_path):
 
 @pytest.mark.ray
 def test_a_run_reaches_its_target_whatever_is_killed(shoal):
-    schedule = ("--env-steps", "300000", "--faults", "4", "--every-s", "2", "--seed", "1")
+    schedule = ("--env-steps", "400000", "--faults", "4", "--every-s", "2", "--seed", "1")
     done = shoal("chaos", "--out", "chaos", *schedule)
     assert done.returncode == 0, done.stdout + done.stderr
     end = re.search(r"(\d+) faults; target reached, accounts balance, MLflow has every row once", done.stdout)
     assert end and int(end[1]) >= 2, done.stdout  # a fast machine may be done before the fourth
     learned = re.search(r"success rate ([\d.]+) % \(", done.stdout)
-    assert learned and float(learned[1]) > 40, done.stdout  # undisturbed, three seeds gave 72 to 83
+    assert learned and float(learned[1]) > 40, done.stdout  # undisturbed, 72 to 83 after three quarters
 
 
 def test_a_used_folder_is_refused(tmp_path, capsys):
