@@ -1,13 +1,15 @@
 """The shield in the worlds of preset `best`, 25 setups: success, and collisions per million robot steps.
 
-A collision in spite of the shield is played again. Its robot was squeezed if the half-planes of the robots that it had
-sensed one simulator step before permitted no velocity; if they did, the robot that it hit has left its velocity.
+A collision in spite of the shield is played again. The robot was squeezed if in the last simulator step the half-planes
+of the robots that it sensed permitted no velocity. It was run into if nobody would have touched it, had all others kept
+their velocities, as the half-planes assume. What is left are collisions that the half-planes could have avoided.
 
 python -m tests.benchmarks.shield --methods in out --episodes 1000     # 100,000 episodes of the rule `greedy`
 """
 
 import argparse
 import dataclasses
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from typing import NamedTuple
@@ -32,12 +34,15 @@ METHODS = ("in", "out", "sensor")
 SHIELDS = ("none", "orca")
 
 
+CAUSES = SQUEEZED, RUN_INTO, AVOIDABLE = ("squeezed", "run into", "avoidable")
+
+
 class Played(NamedTuple):
-    """Episodes of one setup: successes `[episodes]`, collisions, those of squeezed robots, and steps in all."""
+    """Episodes of one setup: successes `[episodes]`, collisions, how they came with a shield, and steps in all."""
 
     goals: np.ndarray
     collisions: int
-    squeezed: int
+    causes: Counter[str]
     steps: int
 
 
@@ -47,18 +52,23 @@ def play(method: str, shield: str, robots: int, groups: int, episodes: int) -> P
     spec, seeds = EnvSpec(ENV_ID, world), list(range(FIRST_SEED, FIRST_SEED + episodes))
     stats = evaluate(spec, Baseline.GREEDY, seeds)
     collided = np.flatnonzero(stats.outcome == Outcome.COLLISION)
-    squeezed = sum(is_squeezed(spec, seeds[i]) for i in collided) if shield != SHIELDS[0] else 0
-    return Played(stats.outcome == Outcome.GOAL, len(collided), squeezed, int(stats.length_steps.sum()))
+    causes = Counter(cause(spec, seeds[i]) for i in collided) if shield != SHIELDS[0] else Counter[str]()
+    return Played(stats.outcome == Outcome.GOAL, len(collided), causes, int(stats.length_steps.sum()))
 
 
-def is_squeezed(spec: EnvSpec, seed: int) -> bool:
-    """Whether the half-planes left no velocity in the last simulator step of an episode."""
+def cause(spec: EnvSpec, seed: int) -> str:
+    """How the collision at an episode's end came: one of CAUSES."""
     episode, world = record_episode(spec, Baseline.GREEDY, seed), spec.world
+    before = episode.position[-2] + episode.velocity[-2] * world.time_step_s
+    before[episode.learner] = episode.position[-1, episode.learner]
+    away = np.linalg.norm(before - before[episode.learner], axis=1)
+    if (np.delete(away, episode.learner) > 2 * world.robot_radius_m).all():
+        return RUN_INTO
     radius = world.robot_radius_m + world.shield_margin_m
     clearance = Clearance(radius, world.shield_horizon_s, world.outer_radius_m)
     lines = half_planes(episode.position[-2], episode.velocity[-2], episode.learner, clearance)
     top_speed = world.method_class.top_speed_m_s(world) * SPEED_MARGIN
-    return closest_permitted(lines, top_speed, episode.asked[-2].astype(float)) is None
+    return SQUEEZED if closest_permitted(lines, top_speed, episode.asked[-2].astype(float)) is None else AVOIDABLE
 
 
 def main(methods: Sequence[str] = METHODS, episodes: int = 40) -> None:
@@ -70,7 +80,7 @@ def main(methods: Sequence[str] = METHODS, episodes: int = 40) -> None:
         "shield",
         "success",
         "collisions",
-        "squeezed",
+        *CAUSES,
         "per million robot steps",
         "least gained in a setup",
     ):
@@ -83,19 +93,19 @@ def main(methods: Sequence[str] = METHODS, episodes: int = 40) -> None:
             }
             for shield, played in found.items():
                 goals, steps = np.concatenate([one.goals for one in played]), sum(one.steps for one in played)
-                collisions, squeezed, gained = sum(one.collisions for one in played), "", ""
+                collisions, causes, gained = sum(one.collisions for one in played), [""] * len(CAUSES), ""
                 if shield != SHIELDS[0]:
                     pairs = zip(found[SHIELDS[0]], played, setups, strict=True)
                     gains = [(paired_comparison(a.goals, b.goals).difference, at) for a, b, at in pairs]
-                    squeezed = str(sum(one.squeezed for one in played))
+                    causes = [str(sum(one.causes[name] for one in played)) for name in CAUSES]
                     least, (robots, groups) = min(gains)
                     low, high = 100 * least.low, 100 * least.high
                     gained = f"{100 * least.value:+.1f} points ({low:+.1f} … {high:+.1f}), {robots}r×{groups}g"
                 share = as_percent(rate(int(goals.sum()), len(goals)))
                 per_million = f"{1e6 * collisions / steps:.1f}"
-                table.add_row(method, shield, share, str(collisions), squeezed, per_million, gained)
+                table.add_row(method, shield, share, str(collisions), *causes, per_million, gained)
             table.add_section()
-    Console(width=150).print(table)
+    Console(width=155).print(table)
 
 
 if __name__ == "__main__":
