@@ -118,8 +118,8 @@ $(VENV)/cadrl/.ready: $(READY)
 shares: $(READY)
 	$(BIN)/python -m tests.benchmarks.shares $(ARGS)
 
-# Policies trained for bad senses beside ones trained without, and the rules: 27 trainings of two minutes, then 17 conditions
-# in three setups. ARGS="--methods sensor --seeds 0" for some.
+# Policies trained for bad senses beside ones trained without, and the rules: 36 trainings of a minute or two, then 16
+# conditions in three setups. ARGS="--methods sensor --seeds 0" for some.
 robustness: $(READY)
 	$(BIN)/python -m tests.benchmarks.robustness $(ARGS)
 

@@ -6,9 +6,10 @@ true state, and the robot's own position, velocity and goal are always true.
 
 In every simulator step, another robot's position is late (a ring of past states), then known or not (dropped for the
 episode, out of range or view, in a burst of loss, lost by itself), then noisy; some are mixed up with robots of
-other groups. A burst is the bad state of a channel of two states, one channel a robot, which begins in its stationary
-distribution (Gilbert 1960, "Capacity of a burst-noise channel"). A velocity command takes effect late, and is driven
-with an error of speed and heading.
+other groups. Last, a robot that is not sensed any more may be tracked (`track_steps`): for so many steps it is taken to
+go on with its last velocity. A burst is the bad state of a channel of two states, one channel a robot, which begins in
+its stationary distribution (Gilbert 1960, "Capacity of a burst-noise channel"). A velocity command takes effect late,
+and is driven with an error of speed and heading.
 
 Every random number is a draw of a stream of its own, counted from the episode's start. So the swarm meets the same
 noise under all conditions, and a position that is lost with a small probability is lost with a larger one, too.
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_core.config import WorldConfig
-from sim_core.jit import for_types_of, inlined, kernel
+from sim_core.jit import StateKernel, inlined, kernel
 from sim_core.lanes import LANES, any_lane, convert, extract_lane, load_some, select, splat, sqrt, store_some
 from sim_core.packed import packed
 from sim_core.rng import add_normal, bits_at, uniform_at, uniforms_at
@@ -408,13 +409,13 @@ def _sense(truth, mask, memory, params):
 
 
 @kernel
-def _drive(steps, mask, command_x, command_y, stream, conditions, commands, params):
+def _drive(truth, mask, command_x, command_y, stream, conditions, commands, params):
     p = params[0]
     num_robots = p.group.shape[0]
     for world in range(mask.shape[0]):
         if not mask[world]:
             continue
-        c, step, late = conditions[world], steps[world], commands[world]
+        c, step, late = conditions[world], truth.steps[world], commands[world]
         now, then = _places(step, late.shape[0], c[COMMAND_DELAY])
         late[now, 0], late[now, 1] = command_x[world], command_y[world]
         x, y = late[then, 0], late[then, 1]
@@ -447,12 +448,7 @@ class Senses:
         self._known = dict(zip(_PASSED, memory.known, strict=True))
         self._senses_badly, self._drives_badly = config.senses_badly, config.drives_badly
         self.sensed: WorldState = state._replace(**self._known) if self._senses_badly else state
-        mask, command = np.zeros(len(state.learner), np.bool_), np.zeros(len(state.learner), np.float32)
-        if self._senses_badly:
-            self._sense = for_types_of(_sense, self._truth, mask, memory, self._params)
-        if self._drives_badly:
-            self._drives_with = memory.stream, memory.conditions, self._commands, self._params
-            self._drive = for_types_of(_drive, state.steps, mask, command, command, *self._drives_with)
+        self._sense, self._drive = StateKernel(_sense), StateKernel(_drive)
 
     def begin(self, mask: NDArray[np.bool_]) -> None:
         """Begins the episodes that have just been set up where `mask` `[num_worlds]` is set, and senses."""
@@ -467,7 +463,8 @@ class Senses:
     def drive(self, mask: NDArray[np.bool_], command_x: NDArray[np.float32], command_y: NDArray[np.float32]) -> None:
         """Changes commands `[num_worlds]` (m/s) to what the robots drive, where `mask` is set; before every step."""
         if self._drives_badly:
-            self._drive(self._truth.steps, mask, command_x, command_y, *self._drives_with)
+            driven_with = self._memory.stream, self._memory.conditions, self._commands, self._params
+            self._drive(self._truth, mask, command_x, command_y, *driven_with)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays that steps change, by name, each with the worlds along its first axis."""

@@ -23,6 +23,7 @@ from actors.evaluation.statistics import Estimate, mean
 from actors.policy.baselines import Baseline, exists
 from actors.rollout.env_spec import EnvSpec
 from actors.service.messages import EpisodeStats
+from deploy.console.summary_tables import signed_percent
 from deploy.runs.policy_lookup import find_policy
 from learner.presets import preset_config
 from learner.run_folder import RunFolder
@@ -138,13 +139,12 @@ def table(method: str, rows: list[Row], seen: int, options: argparse.Namespace) 
         found.add_column(name, justify="left" if name in ("setup", "better rule", "verdict") else "right")
     for i, row in enumerate(rows):
         low, middle, high = (100 * value for value in (min(row.rates), float(np.mean(row.rates)), max(row.rates)))
-        value, below, above = (100 * number for number in row.difference)
         found.add_row(
             row.setup + (" (unseen)" if i >= seen else ""),
             row.rule,
             f"{100 * row.rule_rate:.1f} %",
             f"{middle:.1f} % ({low:.1f} … {high:.1f})",
-            f"{value:+.1f} ({below:+.1f} … {above:+.1f})",
+            signed_percent(row.difference),
             row.verdict,
         )
     return found

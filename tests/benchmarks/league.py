@@ -21,6 +21,7 @@ from actors.evaluation.evaluator import Candidate, evaluate
 from actors.evaluation.statistics import as_percent, mean, rate
 from actors.policy.baselines import Baseline
 from actors.rollout.env_spec import EnvSpec
+from deploy.console.summary_tables import signed_percent
 from deploy.runs.policy_lookup import find_policy
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig
@@ -69,7 +70,7 @@ def players(setup: str, methods: tuple[str, ...], has_cadrl: bool, options: argp
         folder = trained(options.runs_dir, f"{name}-{setup}-{options.seed}", [*settings, "--seed", str(options.seed)])
         config = folder.config()
         worlds.append(config.world)
-        yield Player(f"M_{name if name == 'sensor' else name.upper()}", config.world, find_policy(folder, config))
+        yield Player(config.world.method_class.label, config.world, find_policy(folder, config))
     for rule in (Baseline.GREEDY, Baseline.FIELD):
         having = [world for world in worlds if rule in world.method_class.rules(world)]
         if having:
@@ -88,8 +89,7 @@ def add_rows(result: Table, setup: str, field: list[Player], options: argparse.N
         rates = [f"{100 * np.mean(found == failure):.1f}" for failure in FAILURES]
         difference = ""
         if CADRL in outcomes and name != CADRL:
-            value, low, high = (100 * each for each in mean(reached[name].astype(float) - reached[CADRL]))
-            difference = f"{value:+.1f} ({low:+.1f} … {high:+.1f})"
+            difference = signed_percent(mean(reached[name].astype(float) - reached[CADRL]))
         result.add_row(setup, name, as_percent(rate(int(reached[name].sum()), len(seeds))), *rates, difference)
     result.add_section()
 

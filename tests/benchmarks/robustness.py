@@ -23,6 +23,7 @@ from actors.evaluation.conditions import Axis, breaking_point, grid, parse_axis
 from actors.evaluation.statistics import Estimate, mean
 from actors.policy.baselines import Baseline, exists
 from dashboards.figures.stress_curves import Panel, stress_curves_png
+from deploy.console.summary_tables import signed_percent
 from deploy.options.results import Stress
 from deploy.playing.players import find_players
 from deploy.playing.stress_results import StressResults
@@ -142,8 +143,7 @@ def table(method: str, found: list[Curve], options: argparse.Namespace) -> Table
             texts = []
             for player in players:
                 goals = at[player].goals[row]
-                difference, low, high = (100 * share for share in mean(goals - clean[setup]))
-                texts.append(f"{100 * goals.mean():.1f}: {difference:+.1f} ({low:+.1f} … {high:+.1f})")
+                texts.append(f"{100 * goals.mean():.1f}: {signed_percent(mean(goals - clean[setup]))}")
             result.add_row("" if number else setup, f"{axis} {value}" if value else "none", *texts)
         result.add_section()
     return result

@@ -17,6 +17,7 @@ from actors.evaluation.result_table import GROUPS, ROBOTS
 from actors.evaluation.statistics import as_percent, paired_comparison, rate
 from actors.policy.baselines import Baseline
 from actors.rollout.vector_env import EnvSpec
+from deploy.console.summary_tables import signed_percent
 from learner.presets import preset_config
 from sim_core import ENV_ID
 from sim_core.outcomes import Outcome
@@ -61,8 +62,8 @@ def main(episodes: int = 8) -> None:
                 goals = [found == Outcome.GOAL for found in played]
                 cells = [as_percent(rate(int(goals[0].sum()), len(goals[0])))]
                 for reached in goals[1:]:
-                    value, low, high = (100 * x for x in paired_comparison(goals[0], reached).difference)
-                    cells.append(f"{100 * reached.mean():.1f} %: {value:+.1f} ({low:+.1f} … {high:+.1f})")
+                    difference = signed_percent(paired_comparison(goals[0], reached).difference)
+                    cells.append(f"{100 * reached.mean():.1f} %: {difference}")
                 collided = int((played[-1] == Outcome.COLLISION).sum())
                 table.add_row(method, str(player), *cells, as_percent(rate(collided, len(played[-1]))))
             table.add_section()
