@@ -40,6 +40,7 @@ from mlflow.protos.databricks_pb2 import RESOURCE_ALREADY_EXISTS, ErrorCode  # n
 from requests import RequestException  # noqa: E402
 from sqlalchemy.exc import SQLAlchemyError  # noqa: E402
 
+from learner.tracking.empty_store import copy_empty_store  # noqa: E402
 from learner.tracking.mlflow_registry import dataset_inputs, find_policy, register_policy  # noqa: E402
 
 MLFLOW_ERRORS = (MlflowException, SQLAlchemyError, RequestException)
@@ -95,6 +96,7 @@ class Tracker:
         self._experiment_id = ""
         try:
             with opening(uri):
+                copy_empty_store(uri, mlflow_client)
                 self._client = mlflow_client(uri)
                 if experiment is not None:
                     self._open_experiment(experiment, artifact_root)
