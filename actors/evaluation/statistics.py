@@ -175,3 +175,8 @@ def mean(values: np.ndarray) -> Estimate:
         return Estimate(centre, centre, centre)
     half = _quantile(len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values))
     return Estimate(centre, float(centre - half), float(centre + half))
+
+
+def mean_share(shares: np.ndarray) -> Estimate:
+    """`mean` of `shares` `[count]` in 0..1, whose interval ends there, too."""
+    return Estimate(*(float(bound) for bound in np.clip(mean(shares), 0.0, 1.0)))

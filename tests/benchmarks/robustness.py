@@ -20,14 +20,14 @@ from rich.console import Console
 from rich.table import Table
 
 from actors.evaluation.conditions import Axis, breaking_point, grid, parse_axis
-from actors.evaluation.statistics import Estimate, mean
+from actors.evaluation.statistics import Estimate, mean, mean_share
 from actors.policy.baselines import Baseline, exists
 from dashboards.figures.stress_curves import Panel, stress_curves_png
 from deploy.console.summary_tables import signed_percent
 from deploy.options.results import Stress
 from deploy.playing.players import find_players
 from deploy.playing.stress_results import StressResults
-from sim_core.plugins import DISSERTATION_METHODS
+from sim_core.plugins import DISSERTATION_METHODS, METHODS, find
 from tests.benchmarks.trainings import trained
 
 SETUPS = ("5x2", "10x4", "25x4")
@@ -103,7 +103,7 @@ class Curve(NamedTuple):
 
     @property
     def rates(self) -> list[Estimate]:
-        return [Estimate(*np.clip(mean(goals), 0.0, 1.0)) for goals in self.goals]
+        return [mean_share(goals) for goals in self.goals]
 
 
 def curves(method: str, names: list[str], options: argparse.Namespace) -> Iterator[Curve]:
@@ -132,7 +132,7 @@ def table(method: str, found: list[Curve], options: argparse.Namespace) -> Table
     """Success under the conditions shown, and the paired difference to the clean policy without a condition."""
     clean = {curve.setup: curve.goals[0] for curve in found if curve.player == CLEAN}
     players = list(dict.fromkeys(curve.player for curve in found))
-    title = f"{method}: success in %, paired difference to {CLEAN} without conditions"
+    title = f"{find(METHODS, method).label}: success in %, paired difference to {CLEAN} without conditions"
     result = Table(title=f"{title}; {len(options.seeds)} trainings, {options.episodes} episodes")
     for name in ("setup", "condition", *players):
         result.add_column(name, justify="left" if name in ("setup", "condition") else "right")
@@ -152,7 +152,7 @@ def table(method: str, found: list[Curve], options: argparse.Namespace) -> Table
 def breaks(method: str, found: list[Curve]) -> Table:
     """Where the mean over a player's trainings falls to 50 % along each axis."""
     players = list(dict.fromkeys(curve.player for curve in found))
-    result = Table(title=f"{method}: where success falls to 50 %")
+    result = Table(title=f"{find(METHODS, method).label}: where success falls to 50 %")
     for name in ("setup", "condition", *players):
         result.add_column(name, justify="left" if name in ("setup", "condition") else "right")
     for setup in dict.fromkeys(curve.setup for curve in found):
@@ -195,7 +195,7 @@ def main(arguments: list[str] | None = None) -> int:
             for axis in AXES
             for setup in dict.fromkeys(curve.setup for curve in found)
         ]
-        stress_curves_png(panels, path.with_suffix(".png"), f"{method}: success under bad senses")
+        stress_curves_png(panels, path.with_suffix(".png"), f"{find(METHODS, method).label}: success under bad senses")
         print(path.with_suffix(".csv"), path.with_suffix(".png"))
     return 0
 

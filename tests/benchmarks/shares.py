@@ -22,7 +22,7 @@ from rich.table import Table
 
 from actors.evaluation.evaluation_store import stored_or_played
 from actors.evaluation.evaluator import Candidate, evaluate
-from actors.evaluation.statistics import Estimate, mean
+from actors.evaluation.statistics import Estimate, mean, mean_share
 from actors.policy.baselines import Baseline
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.env_spec import EnvSpec
@@ -34,7 +34,7 @@ from learner.run_folder import RunFolder
 from sim_core import ENV_ID
 from sim_core.config import ONE_LEARNER, WorldConfig
 from sim_core.outcomes import Outcome
-from sim_core.plugins import DISSERTATION_METHODS
+from sim_core.plugins import DISSERTATION_METHODS, METHODS, find
 from tests.benchmarks.learners import SHARES
 from tests.benchmarks.trainings import trained
 
@@ -75,7 +75,7 @@ class Played(NamedTuple):
     @property
     def rate(self) -> Estimate:
         """That of all, with the interval of worlds."""
-        return Estimate(*np.clip(mean(self.arrived), 0.0, 1.0))
+        return mean_share(self.arrived)
 
     def text(self) -> str:
         """A cell of the table."""
@@ -108,7 +108,7 @@ class Study(NamedTuple):
 
     @property
     def title(self) -> str:
-        return f"{self.method}{', sectors face the goal' if self.faces_goal else ''} {self.setup}"
+        return f"{find(METHODS, self.method).label}{', sectors face the goal' if self.faces_goal else ''} {self.setup}"
 
     def train(self, learners: str, seed: int) -> RunFolder:
         """A training, which is made unless it is there."""
@@ -117,7 +117,7 @@ class Study(NamedTuple):
         settings += ["--learners", learners, "--seed", str(seed), "--engine", "process", "--experiment", EXPERIMENT]
         settings += ["--final-eval-episodes", str(FINAL_WORLDS)]
         if self.faces_goal:
-            settings += ["--sector-frame", "goal"]
+            settings += ["--sector-frame", "goal", "--random-turns", "False"]
         return trained(self.options.runs_dir, f"{self.name}-{learners}-{seed}", settings)
 
     def world(self) -> WorldConfig:

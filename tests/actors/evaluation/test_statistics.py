@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from actors.evaluation.statistics import dispersion, mean, paired_comparison, rate, ratio, success_rate
+from actors.evaluation.statistics import dispersion, mean, mean_share, paired_comparison, rate, ratio, success_rate
 
 
 def wilson(count, total):
@@ -43,6 +43,12 @@ def test_a_mean_has_students_interval():
     assert mean(values)[1:] == pytest.approx(half)
     # Five values by hand: mean 3, s = sqrt(2.5), t(0.975, 4) = 2.776.
     assert mean(np.arange(1, 6))[1:] == pytest.approx((3 - 2.7764 * 0.70711, 3 + 2.7764 * 0.70711), abs=1e-3)
+
+
+def test_the_interval_of_a_mean_share_ends_at_0_and_1():
+    assert mean_share(np.array([1.0, 1.0, 0.9]))[::2] == (pytest.approx(2.9 / 3), 1.0)
+    assert mean_share(np.array([0.0, 0.0, 0.1]))[1] == 0.0
+    assert mean_share(np.array([0.4, 0.5, 0.6])) == pytest.approx(mean(np.array([0.4, 0.5, 0.6])))
 
 
 @pytest.mark.parametrize("values", [[2.5], [2.5, 2.5, 2.5]])
