@@ -23,6 +23,7 @@ from typing import NamedTuple, NoReturn
 import psutil
 
 from learner.file_names import END, END_STATE, JOURNAL
+from learner.module_order import module_order
 
 PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that the driver gets; it runs in a process group of its own, so a terminal sends them here alone."""
@@ -135,15 +136,6 @@ def _kill_children() -> None:
         _reap()
 
 
-def shoal_order(module: str, arguments: Sequence[str]) -> list[str]:
-    """The command line that runs one of shoal's modules, of the same shoal as this process runs.
-
-    `-m` alone would prefer what the current folder has of the same name; a process that began so goes on so.
-    """
-    is_here = not sys.flags.safe_path and Path(sys.path[0]).resolve() == Path.cwd()  # as `python -m` has it
-    return [sys.executable, *(["-m"] if is_here else ["-P", "-m"]), module, *arguments]
-
-
 def _say(text: str) -> None:
     with suppress(OSError):
         os.write(2, f"shoal: {text}\n".encode())
@@ -157,8 +149,8 @@ def take_over(run: Path, arguments: Sequence[str]) -> NoReturn:
       arguments: those of `shoal` that start the run, without `--supervise`.
     """
     sys.stdout.flush()
-    os.execv(sys.executable, shoal_order("deploy.supervisor", [str(run), *arguments]))
+    os.execv(sys.executable, module_order("deploy.supervisor", [str(run), *arguments]))
 
 
 if __name__ == "__main__":
-    sys.exit(Supervisor(Path(sys.argv[1]), shoal_order("deploy", sys.argv[2:])).supervise())
+    sys.exit(Supervisor(Path(sys.argv[1]), module_order("deploy", sys.argv[2:])).supervise())

@@ -17,24 +17,13 @@ from learner.run import RunResult, RunSession, Step, resume_point
 from learner.run_end import SHOWN, RunEnd
 from learner.run_folder import RunFolder
 from learner.tracking.journal import Row
-from learner.tracking.local_store import find_store
-from learner.tracking.mlflow_run import Tracker
-from learner.tracking.redaction import full_uri, public_uri
+from learner.tracking.redaction import public_uri
+from learner.tracking.tracked_run import TrackedRun
 from learner.training.cluster import Cluster
 from learner.training.stop_signals import Interrupted
 
 
-def open_tracker(folder: RunFolder) -> Tracker:
-    """The MLflow tracker of a run that exists already.
-
-    Raises:
-      ConfigError: its store cannot be opened, or has gone.
-    """
-    identity = folder.identity()
-    return Tracker(full_uri(find_store(identity.tracking_uri, identity.mlflow_run_id, folder.path)), None, None)
-
-
-def finished_at(folder: RunFolder, config: RunConfig, tracker: Tracker) -> int | None:
+def finished_at(folder: RunFolder, config: RunConfig, tracker: TrackedRun) -> int | None:
     """Env steps of a run whose training and end are whole; None of any other.
 
     Runs of earlier versions have no record of their end. MLflow knows whether they have finished.
@@ -63,7 +52,7 @@ def _resume_point(folder: RunFolder, config: RunConfig) -> Checkpoint | None:
     return checkpoint
 
 
-def resume_training(folder: RunFolder, config: RunConfig, tracker: Tracker, options: ClusterOptions) -> int:
+def resume_training(folder: RunFolder, config: RunConfig, tracker: TrackedRun, options: ClusterOptions) -> int:
     """Resumes a run at its end, from its newest usable checkpoint, or from its start; returns the exit code.
 
     Raises:
@@ -84,7 +73,7 @@ def resume_training(folder: RunFolder, config: RunConfig, tracker: Tracker, opti
 def run_training(
     folder: RunFolder,
     config: RunConfig,
-    tracker: Tracker,
+    tracker: TrackedRun,
     checkpoint: Checkpoint | None,
     options: ClusterOptions,
     opened: Cluster | None = None,
@@ -103,7 +92,7 @@ def run_training(
 
                 return artifact_steps(folder, config, tracker, display.message, result, rows)
 
-            shown = EndImports(display, config.total_env_steps) if config.engine == "ray" else display
+            shown = EndImports(display, tracker, config.engine == "ray")
             result = RunSession(folder, config, tracker, shown, options, opened).execute(checkpoint, steps)
     except Interrupted as interrupted:
         return _stopped(folder, interrupted.signal, "")
@@ -122,7 +111,7 @@ def _stopped(folder: RunFolder, number: int, where: str) -> int:
     return 128 + number
 
 
-def _show(folder: RunFolder, config: RunConfig, tracker: Tracker, result: RunResult) -> None:
+def _show(folder: RunFolder, config: RunConfig, tracker: TrackedRun, result: RunResult) -> None:
     """Prints the summary of a finished run, which is then complete if MLflow knows that it is finished."""
     assert result.evaluation is not None
     console = plain_console()

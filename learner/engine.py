@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -22,31 +20,13 @@ def open_cluster(config: RunConfig, incarnation: int, options: ClusterOptions) -
     return RayCluster(config, incarnation, options)
 
 
-def open_early(config: RunConfig, options: ClusterOptions, imports: str) -> Cluster | None:
-    """Starts the components of a new run, before anything else of it, where they start in other processes.
-
-    They then start while this process does the rest, such as opening MLflow's store. Meanwhile a thread imports the
-    module `imports`, since this process mostly waits for Ray. In one process there is nothing to gain: None.
-
-    Raises:
-      ConfigError: see `RayCluster`.
-    """
-    if config.engine == "process":
-        return None
-    from learner.ray_backend.cluster import RayCluster  # before the thread, which would wait for what both import
-
-    threading.Thread(target=importlib.import_module, args=(imports,)).start()
-    return RayCluster(config, 0, options)
-
-
 @contextmanager
-def closed_on_error(cluster: Cluster | None) -> Iterator[None]:
+def closed_on_error(cluster: Cluster) -> Iterator[None]:
     """Closes the components if the `with` block raises anything, Ctrl-C too: a run that has not begun leaves none."""
     try:
         yield
     except BaseException:
-        if cluster is not None:
-            cluster.close()
+        cluster.close()
         raise
 
 

@@ -20,6 +20,7 @@ from actors.evaluation.evaluator import evaluate_in_parallel, worthwhile_calls
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.env_guard import env_guard
 from actors.rollout.env_spec import EnvSpec
+from actors.rollout.vector_env import env_shape
 from actors.rollout.worker import select_stats
 from actors.service.fault_policy import STEADY_CALLS, CallFailed, ComponentFailed, FaultTracker, RunFailed, first_line
 from actors.service.messages import EpisodeStats
@@ -38,9 +39,9 @@ from learner.run_folder import RunFolder
 from learner.tracking.delivery import Delivery, retry
 from learner.tracking.fault_log import FaultLog
 from learner.tracking.journal import Journal, PushedMark, Row
-from learner.tracking.mlflow_run import MLFLOW_ERRORS, Tracker
 from learner.tracking.observer import Display, MirroringObserver
 from learner.tracking.redaction import hide_secrets
+from learner.tracking.tracked_run import TrackedRun, TrackingError
 from learner.training.cluster import Cluster
 from learner.training.evaluation_summary import Evaluation, as_metrics, score, summarise
 from learner.training.recovery import RunLost
@@ -102,7 +103,7 @@ class RunSession:
         self,
         folder: RunFolder,
         config: RunConfig,
-        tracker: Tracker,
+        tracker: TrackedRun,
         display: Display,
         options: ClusterOptions,
         opened: Cluster | None = None,
@@ -246,6 +247,7 @@ class RunSession:
 
         episodes = f"{self._config.final_eval_episodes} greedy episodes"
         self._display.message(f"training done; evaluating {episodes}")
+        self._tracker.begin_policy(end.weights, self._config, env_shape(self._config.env))
         try:
             self._patiently(partial(end.evaluate, play), "the final episodes")
         except CallFailed as failure:
@@ -309,7 +311,7 @@ class RunSession:
         try:
             return retry(make, what, self._tracker.retry_timeout_s, self._say)
         except Exception as error:
-            if not (isinstance(error, MLFLOW_ERRORS) or is_disk_full(error)):
+            if not (isinstance(error, TrackingError) or is_disk_full(error)):
                 raise
             raise self._lacking(what, first_line(error)) from error
 
@@ -348,7 +350,7 @@ class RunSession:
         try:
             retry(lambda: self._tracker.end(status), f"that the run is {status}", timeout_s, self._say)
             return True
-        except MLFLOW_ERRORS as error:
+        except TrackingError as error:
             self._say(f"MLflow does not know that the run is {status}: {first_line(error)}")
             return False
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 from deploy.options.training import Resume
-from deploy.training import finished_at, open_tracker, resume_training
+from deploy.runs.tracking import opened_tracker
+from deploy.training import finished_at, resume_training
 from learner.run_folder import find_run
 from sim_core.checks import require
 
@@ -17,11 +18,10 @@ def run(command: Resume) -> int:
       ConfigError: there is no such run, it has no usable checkpoint, it has finished, or another process trains it.
     """
     folder = find_run(command.run, command.runs_dir)
-    with folder.lock():
+    with folder.lock(), opened_tracker(folder) as tracker:
         config = folder.config()
         total = config.total_env_steps if command.total_env_steps is None else command.total_env_steps
         config = dataclasses.replace(config, total_env_steps=total, device=command.device or config.device)
-        tracker = open_tracker(folder)
         done = finished_at(folder, config, tracker)
         require(
             done is None,

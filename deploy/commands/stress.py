@@ -18,8 +18,10 @@ from deploy.options.training import ray_address
 from deploy.playing.players import Target, check_same_starts, find_players
 from deploy.playing.stress_results import CURVES, StressResults
 from deploy.runs.folders import check_plain_name, make_folder
+from deploy.runs.tracking import opened_tracker
 from learner.file_names import IDENTITY
 from learner.ray_backend.cluster import evaluate_each
+from learner.tracking.tracked_run import TrackingError
 from sim_core.checks import ConfigError
 
 FOLDER = "stress"
@@ -62,14 +64,11 @@ def _log(target: Target, written: Sequence[Path], place: str) -> None:
     """Adds files to the artifacts of a player's run in MLflow, if it has one; says so if that is not possible."""
     if target.folder is None or not (target.folder.path / IDENTITY).is_file():
         return
-    from deploy.training import open_tracker  # imports MLflow, which rules need not wait for
-    from learner.tracking.mlflow_run import MLFLOW_ERRORS
-
     try:
-        tracker, run_id = open_tracker(target.folder), target.folder.identity().mlflow_run_id
-        for path in written:
-            tracker.attach(run_id, path, place)
-    except (ConfigError, *MLFLOW_ERRORS) as error:
+        with opened_tracker(target.folder) as tracker:
+            for path in written:
+                tracker.attach(target.folder.identity().mlflow_run_id, path, place)
+    except (ConfigError, TrackingError) as error:
         plain_console(stderr=True).print(f"not logged to MLflow for {target.name}: {error}", soft_wrap=True)
 
 

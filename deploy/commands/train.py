@@ -17,10 +17,13 @@ from deploy.runs.folders import (
     run_location,
     stamped_name,
 )
+from deploy.runs.tracking import opened_tracker
+from deploy.training import finished_at, resume_training, run_training
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig, config_hash
-from learner.engine import closed_on_error, open_early
-from learner.run_folder import RunFolder, RunIdentity
+from learner.engine import closed_on_error, open_cluster
+from learner.run_folder import RunFolder, RunIdentity, Storage
+from learner.tracking.begin_tracking import TrackingStart
 from learner.tracking.redaction import public_uri
 from learner.training.memory_estimate import check_fits
 from sim_core.checks import require
@@ -46,19 +49,23 @@ def run(command: Train) -> int:
             _check_storage(folder, command.checkpoint_url)
             return _resume(folder, config, launch.cluster_options())
     make_folder(launch.runs_dir, "--runs-dir")
-    check_environment(folder, config, launch.deadline_s)
-    if launch.ray_address() is None:
-        check_fits(config)
-    check_device(config, launch.ray_address())
-    storage = new_storage(command.checkpoint_url, folder.path.name, command.keep_best)
-    with folder.traceback_kept(), env_guard(launch.deadline_s):  # it makes an environment
-        opened = open_early(config, launch.cluster_options(), "deploy.training")
-    from deploy.training import run_training  # not before, since it imports MLflow
-    from learner.tracking.mlflow_run import Tracker
+    with TrackingStart() as tracking:  # before all that takes long
+        check_environment(folder, config, launch.deadline_s)
+        if launch.ray_address() is None:
+            check_fits(config)
+        check_device(config, launch.ray_address())
+        storage = new_storage(command.checkpoint_url, folder.path.name, command.keep_best)
+        return _start(folder, config, storage, launch, tracking)
 
+
+def _start(folder: RunFolder, config: RunConfig, storage: Storage, launch: Launch, tracking: TrackingStart) -> int:
+    """Starts the components while MLflow's store is opened, then the run; trains it; returns the exit code."""
+    tracking.open(launch.tracking(), launch.experiment, launch.artifact_root())
+    with folder.traceback_kept(), env_guard(launch.deadline_s):  # it makes an environment
+        opened = open_cluster(config, 0, launch.cluster_options())
     with ExitStack() as stack:
         with closed_on_error(opened):
-            tracker = Tracker(launch.tracking(), launch.experiment, launch.artifact_root())
+            tracker = tracking.run()
             stack.enter_context(folder.lock())
             _check_free(folder, not folder.has_begun())  # another process may have begun it meanwhile
             tracker.start(config)
@@ -95,14 +102,12 @@ def _check_storage(folder: RunFolder, checkpoint_url: str | None) -> None:
 
 def _resume(folder: RunFolder, config: RunConfig, options: ClusterOptions) -> int:
     """Resumes an unfinished run; returns the exit code."""
-    from deploy.training import finished_at, open_tracker, resume_training  # here, since it imports MLflow
-
     require(
         config_hash(folder.config()) == config_hash(config),
         f"{folder.path} holds a run of other settings; choose another --name",
     )
-    tracker = open_tracker(folder)
-    if finished_at(folder, config, tracker) is not None:
-        plain_console().print(f"run {folder.path} has finished before", soft_wrap=True)
-        return 0
-    return resume_training(folder, config, tracker, options)
+    with opened_tracker(folder) as tracker:
+        if finished_at(folder, config, tracker) is not None:
+            plain_console().print(f"run {folder.path} has finished before", soft_wrap=True)
+            return 0
+        return resume_training(folder, config, tracker, options)

@@ -22,7 +22,7 @@ from learner.file_names import CONFIG
 from learner.run import RunResult, Step
 from learner.run_folder import RunFolder
 from learner.tracking.journal import Row
-from learner.tracking.mlflow_run import Tracker
+from learner.tracking.tracked_run import TrackedRun
 from learner.training.evaluation_summary import as_metrics, score
 from sim_core.checks import ConfigError
 from sim_core.outcomes import Outcome
@@ -35,7 +35,7 @@ VIDEO_SIZE_PX = 480
 def artifact_steps(
     folder: RunFolder,
     config: RunConfig,
-    tracker: Tracker,
+    tracker: TrackedRun,
     message: Callable[[str], None],
     result: RunResult,
     rows: list[Row],

@@ -17,8 +17,9 @@ from learner.search.space import Value
 from learner.search.study import SearchStudy
 from learner.search.trial import Progress, read_result, run_trial
 from learner.sweep.cell import SweepLocation
-from learner.tracking.mlflow_run import MLFLOW_ERRORS, Tracker
+from learner.tracking.mlflow_run import Tracker
 from learner.tracking.redaction import hide_secrets
+from learner.tracking.tracked_run import TrackingError
 from sim_core.checks import ConfigError
 
 TRIALS, CELLS, TRACE = "trials", "cells", "error.txt"
@@ -205,7 +206,7 @@ class SearchDriver:
         """Does something in MLflow, without which the search goes on."""
         try:
             act()
-        except (*MLFLOW_ERRORS, ConfigError) as error:
+        except (TrackingError, ConfigError) as error:
             reason = hide_secrets(first_line(error), self._place.tracking_uri)
             self._listener.message(f"MLflow lacks a trial's result: {reason}")
 

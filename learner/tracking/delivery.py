@@ -14,7 +14,7 @@ from typing import TypeVar
 from actors.service.fault_policy import first_line
 from actors.storage.full_disk import DISK_TIMEOUT_S, is_disk_full
 from learner.tracking.journal import Journal, PushedMark, Row
-from learner.tracking.mlflow_run import MLFLOW_ERRORS, Tracker
+from learner.tracking.tracked_run import TrackedRun, TrackingError
 
 T = TypeVar("T")
 
@@ -35,7 +35,7 @@ class Delivery:
       say: shows a line to the user.
     """
 
-    def __init__(self, tracker: Tracker, journal: Journal, pushed: PushedMark, say: Callable[[str], None]) -> None:
+    def __init__(self, tracker: TrackedRun, journal: Journal, pushed: PushedMark, say: Callable[[str], None]) -> None:
         self._tracker = tracker
         self._journal = journal
         self._pushed = pushed
@@ -91,7 +91,7 @@ class Delivery:
                     return False
                 self._pushed.write(end)
                 self._changed.notify_all()
-        except (*MLFLOW_ERRORS, OSError) as error:  # OSError: the mark's file cannot be written
+        except (TrackingError, OSError) as error:  # OSError: the mark's file cannot be written
             if self._refused is None:
                 self._say(f"MLflow does not take the metrics, they are kept and sent again: {first_line(error)}")
             self._refused = first_line(error)
@@ -118,7 +118,7 @@ def retry(call: Callable[[], T], what: str, timeout_s: float, say: Callable[[str
         except Exception as error:
             is_full = is_disk_full(error)
             patience_s = DISK_TIMEOUT_S if is_full else timeout_s
-            if not (is_full or isinstance(error, MLFLOW_ERRORS)) or time.monotonic() + pause_s - start_s > patience_s:
+            if not (is_full or isinstance(error, TrackingError)) or time.monotonic() + pause_s - start_s > patience_s:
                 raise
             reason = "the disk is full, which leaves no room for" if is_full else "MLflow did not take"
             say(f"{reason} {what}, trying again: {first_line(error)}")

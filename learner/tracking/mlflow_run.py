@@ -1,8 +1,10 @@
-"""A run in MLflow, written by the driver alone: one client, and an explicit run id in every call."""
+"""A run in MLflow, written by one process alone: one client, and an explicit run id in every call."""
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import importlib
 import logging
 import math
 import os
@@ -10,24 +12,30 @@ import shlex
 import socket
 import sqlite3
 import subprocess
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from actors.evaluation.result_table import LEARNED
-from actors.policy.policy import WeightsSnapshot
-from actors.rollout.vector_env import EnvShape
 from actors.service.fault_policy import first_line
+from actors.storage.full_disk import is_disk_full, is_full
 from learner.config import RunConfig, config_hash, flat_params, user_files
 from learner.file_names import USER_FILES
 from learner.tracking.journal import FINAL, Row, mlflow_metrics
 from learner.tracking.local_store import opening
 from learner.tracking.mlflow_views import TAG, experiment_views, packed_view
 from learner.tracking.redaction import VARIABLE, hide_secrets, public_uri
+from learner.tracking.tracked_run import TrackedRun, TrackingError
 from sim_core.checks import ConfigError
+
+if TYPE_CHECKING:
+    from actors.policy.policy import WeightsSnapshot
+    from actors.rollout.vector_env import EnvShape
 
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
@@ -45,11 +53,31 @@ from learner.tracking.mlflow_registry import dataset_inputs, find_policy, regist
 
 MLFLOW_ERRORS = (MlflowException, SQLAlchemyError, RequestException)
 """What MLflow's client raises when its store fails."""
-SERVER_TIMEOUT_S = 600.0
-"""How long a finished run waits for a server that does not answer."""
 MAX_BATCH = 900
 """Metrics in one request; MLflow accepts at most 1,000."""
 CONNECT_TIMEOUT_S = 5.0
+STORE_MODULES = ("mlflow.store.tracking.sqlalchemy_store",)
+"""What MLflow imports once a database is opened."""
+END_MODULES = ("learner.tracking.mlflow_policy", "torch._dynamo")
+"""What `Tracker.log_policy` imports: MLflow's export of a network loads PyTorch's compiler."""
+
+
+def load(modules: Iterable[str]) -> None:
+    """Imports modules before they are needed."""
+    for name in modules:
+        importlib.import_module(name)
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """Raises TrackingError for what MLflow's client raises when its store fails; a full disk is told as such."""
+    try:
+        yield
+    except MLFLOW_ERRORS as error:
+        reason = first_line(error)
+        if is_disk_full(error) and not is_full(reason):
+            reason = f"{reason} ({os.strerror(errno.ENOSPC)})"
+        raise TrackingError(reason) from error
 
 
 def check_reachable(uri: str) -> None:
@@ -74,8 +102,8 @@ def mlflow_client(uri: str) -> mlflow.MlflowClient:
     return mlflow.MlflowClient(uri)
 
 
-class Tracker:
-    """One MLflow run.
+class Tracker(TrackedRun):
+    """One MLflow run, written by this process.
 
     Args:
       uri: tracking URI.
@@ -88,10 +116,8 @@ class Tracker:
 
     def __init__(self, uri: str, experiment: str | None, artifact_root: str | None) -> None:
         check_reachable(uri)
-        self.uri = uri
-        self.run_id = ""
-        self.started_ms = 0
-        """Start of the run in ms since the epoch."""
+        super().__init__(uri)
+        self._logging_network = threading.Lock()
         self._logged: set[tuple[str, int]] = set()
         self._experiment_id = ""
         try:
@@ -136,15 +162,11 @@ class Tracker:
     def _variable(self) -> str:
         return f"{VARIABLE}={shlex.quote(public_uri(self.uri))}"
 
-    @property
-    def retry_timeout_s(self) -> float:
-        """How long to retry a failed call: a server may come back, a local store will not."""
-        return SERVER_TIMEOUT_S if self.uri.startswith(("http:", "https:")) else 0.0
-
     @cached_property
     def _commit(self) -> str:
         return git_commit()
 
+    @_told()
     def start(self, config: RunConfig, tags: dict[str, str] | None = None) -> None:
         """Creates the run with the whole config as params.
 
@@ -169,16 +191,19 @@ class Tracker:
         self.run_id, self.started_ms = run.info.run_id, run.info.start_time
         self.log_inputs(config)
 
+    @_told()
     def start_trial(self, name: str, tags: dict[str, str]) -> None:
         """Creates a run of a search's trial."""
         given = {"mlflow.runName": name, "mlflow.source.git.commit": self._commit} | tags
         run = self._client.create_run(self._experiment_id, tags=given)
         self.run_id, self.started_ms = run.info.run_id, run.info.start_time
 
+    @_told()
     def log_params(self, params: dict[str, str]) -> None:
         """Logs the settings that a search's trial varies; harmless to repeat."""
         self._client.log_batch(self.run_id, params=[Param(key, value) for key, value in params.items()])
 
+    @_told()
     def log_inputs(self, config: RunConfig) -> None:
         """Logs the whole config with a user's own files, and the episodes it names; harmless to repeat."""
         params = [Param(key, _param_text(key, value)) for key, value in flat_params(config).items()]
@@ -187,6 +212,7 @@ class Tracker:
             self._client.log_text(self.run_id, text, f"{USER_FILES}/{name}")
         self._client.log_inputs(self.run_id, datasets=dataset_inputs(config, self._commit))
 
+    @_told()
     def find_run(self, tags: dict[str, str]) -> str | None:
         """Id of the experiment's oldest run with all `tags`; None if there is none."""
         has_all = " and ".join(f"tags.`{name}` = '{value}'" for name, value in tags.items())
@@ -202,6 +228,7 @@ class Tracker:
         except MlflowException:
             return False
 
+    @_told()
     def resume(self, run_id: str) -> None:
         """Continues an existing run; its tag `attempts` counts the run's sessions.
 
@@ -227,11 +254,20 @@ class Tracker:
             ) from error
         self.run_id, self.started_ms = run_id, run.info.start_time
 
+    @_told()
+    def rejoin(self, run_id: str) -> None:
+        """Goes on with a run of this session, which another process has begun to write."""
+        run = self._client.get_run(run_id)
+        self._experiment_id = run.info.experiment_id
+        self.run_id, self.started_ms = run_id, run.info.start_time
+
+    @_told()
     def skip_logged_metrics(self) -> None:
         """Makes `push` skip each value whose metric the run already has at the same step."""
         for key in self._client.get_run(self.run_id).data.metrics:
             self._logged |= {(key, metric.step) for metric in self._client.get_metric_history(self.run_id, key)}
 
+    @_told()
     def push(self, rows: list[Row]) -> None:
         """Logs journal rows (see `mlflow_metrics`); a row that is pushed twice is stored once."""
         metrics = [
@@ -243,6 +279,7 @@ class Tracker:
         for start in range(0, len(metrics), MAX_BATCH):
             self._client.log_batch(self.run_id, metrics=metrics[start : start + MAX_BATCH])
 
+    @_told()
     def log_results(self, metrics: dict[str, float], time_ms: int) -> None:
         """Logs the run's results at step 0, where the UI draws them as bars.
 
@@ -252,24 +289,29 @@ class Tracker:
         """
         self.push([Row(0, time_ms, {f"{FINAL}{key}": value for key, value in metrics.items()})])
 
-    def log_policy(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape, score: float) -> None:
-        """Logs and registers the greedy policy's Q-network, a model that maps observations to action values.
+    def load_end(self) -> None:
+        """Does nothing: `log_policy` loads what it needs."""
 
-        A policy that is logged twice is stored once.
+    def begin_policy(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> None:
+        """Does nothing: all of it is this process's work."""
 
-        Args:
-          weights: the policy's weights.
-          config: the run's config.
-          shape: shape of its environment.
-          score: by which the registry ranks the policies of a setup.
-        """
+    @_told()
+    def log_network(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape) -> str:
+        """Logs the greedy policy's Q-network unless the run has it; returns the model's URI."""
         from learner.tracking.mlflow_policy import log_network  # here, since it imports torch
 
-        with tracking_at(self.uri):
+        with self._logging_network, tracking_at(self.uri):
             logged = find_policy(self._client, self._experiment_id, self.run_id, weights.version)
-            uri = logged.model_uri if logged else log_network(self.run_id, weights, config, shape)
+            return str(logged.model_uri) if logged else log_network(self.run_id, weights, config, shape)
+
+    @_told()
+    def log_policy(self, weights: WeightsSnapshot, config: RunConfig, shape: EnvShape, score: float) -> None:
+        """Logs and registers the greedy policy's Q-network (see TrackedRun)."""
+        uri = self.log_network(weights, config, shape)
+        with tracking_at(self.uri):
             register_policy(self._client, config, self.run_id, weights.version, uri, score)
 
+    @_told()
     def log_artifact(self, path: Path) -> None:
         """Uploads a file or a folder to the run's artifacts."""
         if path.is_dir():
@@ -277,6 +319,7 @@ class Tracker:
         else:
             self._client.log_artifact(self.run_id, str(path))
 
+    @_told()
     def attach(self, run_id: str, path: Path, place: str) -> None:
         """Uploads a file to the folder `place` of the artifacts of a run that has ended."""
         self._client.log_artifact(run_id, str(path), place)
@@ -300,6 +343,7 @@ class Tracker:
         finally:
             self.end(status)
 
+    @_told()
     def end(self, status: str) -> None:
         """Ends the run with the status FINISHED, KILLED or FAILED."""
         self._client.set_terminated(self.run_id, status)

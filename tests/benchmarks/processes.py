@@ -7,8 +7,9 @@ import numpy as np
 import psutil
 
 from deploy.chaos.processes import TITLES
+from learner.tracking import tracker_process
 
-SPY, IDLE = "profiler", "idle worker of Ray"
+SPY, IDLE, MLFLOW = "profiler", "idle worker of Ray", "MLflow"
 
 
 def kind_of(process: psutil.Process) -> str:
@@ -16,6 +17,8 @@ def kind_of(process: psutil.Process) -> str:
     words = process.cmdline() or [process.name()]
     if Path(words[0]).name == "py-spy":
         return SPY
+    if tracker_process.__name__ in words:
+        return MLFLOW
     for kind, title in TITLES.items():
         if words[0].startswith(title):
             return kind

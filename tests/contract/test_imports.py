@@ -42,15 +42,15 @@ PROCESSES = {
     "an environment": (ENVIRONMENT, MEASURED - KERNELS),
     "a rollout worker": (WORKER, MEASURED - KERNELS - {"ray", "zarr"}),
     "the learner": (LEARNER, MEASURED - KERNELS - {"torch", "ray", "zarr"}),
-    "the driver": ("import deploy.training", MEASURED - KERNELS - {"mlflow", "zarr", "pandas"}),
     "an evaluation of a rule": ("import deploy.commands.evaluate", MEASURED - KERNELS - {"ray", "zarr"}),
     "the pictures at the end of a run": (
         "import deploy.runs.artifacts",
-        MEASURED - KERNELS - {"mlflow", "zarr", "pandas", "matplotlib"},
+        MEASURED - KERNELS - {"zarr", "matplotlib"},
     ),
-    "the driver before it opens MLflow's store": (
-        "import deploy.commands.train",
-        MEASURED - KERNELS - {"zarr"},
+    "the driver": ("import deploy.commands.train, deploy.commands.resume", MEASURED - KERNELS - {"zarr"}),
+    "the process that writes to MLflow": (
+        "import sim_core, learner.tracking.mlflow_run, mlflow.store.tracking.sqlalchemy_store",
+        MEASURED - {"mlflow", "pandas"},
     ),
 }
 """A program for each kind of process, and what it may not import."""

@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from deploy.supervisor import RESUMES, Reached, reached, shoal_order
+from deploy.supervisor import RESUMES, Reached, reached
 
 PATIENCE_S = 120.0
 SUPERVISE = "import sys; from pathlib import Path; from deploy.supervisor import Supervisor\n"
@@ -182,9 +182,3 @@ def test_supervisor_and_driver_are_of_the_shoal_that_began(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     ended = subprocess.run(order, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
     assert (ended.returncode, ended.stderr) == (2, "shoal: --name greedy is that of a baseline; choose another\n")
-
-
-@pytest.mark.parametrize(("first", "options"), [("", ["-m"]), (".", ["-m"]), ("/elsewhere", ["-P", "-m"])])
-def test_a_process_that_python_took_from_the_current_folder_goes_on_there(monkeypatch, first, options):
-    monkeypatch.setattr(sys, "path", [first, *sys.path])
-    assert shoal_order("deploy", ["train"]) == [sys.executable, *options, "deploy", "train"]

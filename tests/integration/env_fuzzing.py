@@ -217,6 +217,12 @@ class QuietTracker(NoTracker):
     def log_results(self, metrics: dict[str, float], time_ms: int) -> None:
         assert all(map(np.isfinite, metrics.values())), metrics
 
+    def load_end(self) -> None:
+        pass
+
+    def begin_policy(self, weights: Any, *others: Any) -> None:
+        _check_finite("policy", *weights.arrays)
+
     def log_artifact(self, path: Path) -> None:
         assert path.exists()
 

@@ -28,6 +28,7 @@ import deploy.commands.sweep
 import deploy.commands.train
 import deploy.commands.watch
 import deploy.training
+import learner.tracking.mlflow_run
 from deploy.cli import BAD_INPUT, main
 from learner.config import RunConfig
 from learner.run_folder import RunFolder, RunIdentity
@@ -87,8 +88,9 @@ def workplace(folder: Path) -> Iterator[None]:
     (folder / "a-file").write_text("of no use")
     (folder / "results.csv").write_text("preset,policy\n")
     ports = {
-        deploy.training: ("RunSession", "Tracker"),
-        deploy.commands.train: ("open_early",),
+        deploy.training: ("RunSession",),
+        learner.tracking.mlflow_run: ("Tracker",),
+        deploy.commands.train: ("open_cluster",),
         deploy.commands.sweep: ("run_cells", "Tracker"),
         deploy.commands.evaluate: ("evaluate_in_tasks", "record_episode"),
         deploy.commands.stress: ("evaluate_each",),

@@ -2,8 +2,7 @@
 
 import pytest
 
-from learner.cluster_options import ClusterOptions
-from learner.engine import closed_on_error, open_early
+from learner.engine import closed_on_error
 from sim_core.checks import ConfigError
 
 
@@ -26,11 +25,6 @@ def test_components_are_closed_whatever_keeps_the_run_from_beginning(error):
 
 def test_components_of_a_run_that_begins_stay():
     cluster = Components()
-    with closed_on_error(cluster), closed_on_error(None):
+    with closed_on_error(cluster):
         pass
     assert cluster.closed == 0
-
-
-def test_nothing_starts_early_in_one_process(small_run):
-    assert small_run.engine == "process"
-    assert open_early(small_run, ClusterOptions(), "deploy.training") is None

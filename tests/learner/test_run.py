@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from requests import ConnectionError as NoConnection
 
 from actors.rollout.vector_env import env_shape
 from actors.service.fault_policy import Component, ComponentFailed, ComponentKind, Fault, RunFailed
@@ -13,6 +12,7 @@ from actors.service.messages import EpisodeStats
 from learner.cluster_options import ClusterOptions
 from learner.run import RunSession, Step
 from learner.run_folder import RunFolder
+from learner.tracking.tracked_run import TrackingError
 from learner.training.cluster import ProcessCluster
 from learner.training.recovery import RunLost
 from learner.update.learner import Learner
@@ -32,10 +32,13 @@ class FakeTracker:
     uri, started_ms, retry_timeout_s = "sqlite:///mlflow.db", 1_000, 0.0
 
     def __init__(self):
-        self.results, self.status = [], None
+        self.results, self.status, self.begun = [], None, None
 
     def push(self, rows):
         pass
+
+    def begin_policy(self, weights, config, shape):
+        self.begun = weights.version
 
     def log_results(self, metrics, time_ms):
         self.results.append((metrics["success_rate"], time_ms))
@@ -107,6 +110,7 @@ def test_a_finished_run_is_evaluated_and_logged(session):
     assert result.evaluation.episodes == 2 and result.is_known and result.weights.version == 7
     assert all(map(np.array_equal, result.episodes, EPISODES)) and len(finished) == 1 and not finished[0][1]
     assert session.tracker.results == [(1.0, 3_000)] and session.tracker.status == "FINISHED"
+    assert session.tracker.begun == 7
 
 
 def test_a_lost_learner_leads_to_another_attempt(session):
@@ -127,7 +131,7 @@ def test_an_error_ends_the_mlflow_run_with_its_status(session, error, status):
 
 def test_a_store_that_fails_at_the_end_is_reported_and_hides_no_result(session, monkeypatch):
     def fail(status):
-        raise NoConnection("away")
+        raise TrackingError("away")
 
     session.outcomes.append(True)
     monkeypatch.setattr(session.tracker, "end", fail)
@@ -138,7 +142,7 @@ def test_a_store_that_fails_at_the_end_is_reported_and_hides_no_result(session, 
 
 def test_artifacts_that_mlflow_refuses_fail_the_run_which_can_be_resumed(session):
     def fail():
-        raise NoConnection("away")
+        raise TrackingError("away")
 
     session.outcomes.append(True)
     with pytest.raises(RunFailed, match=r"its end lacks the artifacts \(away\); `shoal resume .*r` makes it"):

@@ -9,6 +9,7 @@ from deploy.runs.search_results import summary_of, write_trials
 from learner.search.config import SearchConfig
 from learner.search.study import SearchStudy
 from learner.tracking.mlflow_run import Tracker
+from learner.tracking.tracked_run import TrackingError
 
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy is deprecated")
 
@@ -156,6 +157,6 @@ def test_without_mlflow_the_search_goes_on(place, monkeypatch):
     driver, study, told = open_driver(search, place)
     number, settings = driver.next()
     work(search, place, number, settings, lambda progress: None)
-    monkeypatch.setattr(Tracker, "log_results", lambda *given: (_ for _ in ()).throw(mlflow.MlflowException("gone")))
+    monkeypatch.setattr(Tracker, "log_results", lambda *given: (_ for _ in ()).throw(TrackingError("gone")))
     driver.finished(number)
     assert study.records()[0].state == "complete" and told.messages == ["MLflow lacks a trial's result: gone"]

@@ -4,11 +4,11 @@ import threading
 from contextlib import closing
 
 import pytest
-from requests import ConnectionError as NoConnection
 
 from learner.tracking import delivery as delivery_module
 from learner.tracking.delivery import Delivery, retry
 from learner.tracking.journal import Journal, PushedMark, Row
+from learner.tracking.tracked_run import TrackingError
 
 ROWS = [Row(100 * i, 1_700_000_000_000 + i, {"a": float(i)}) for i in range(12)]
 
@@ -25,7 +25,7 @@ class Server:
         self.calls += 1
         assert self.busy.wait(30)
         if not self.up:
-            raise NoConnection("connection refused\nmore")
+            raise TrackingError("connection refused")
         self.rows += rows
 
 
@@ -118,7 +118,7 @@ def test_rows_of_a_request_in_flight_at_the_close_do_not_count(server, journal, 
 
 
 def test_a_call_is_retried_until_it_works(said):
-    failures = iter([NoConnection("away"), NoConnection("away")])
+    failures = iter([TrackingError("away"), TrackingError("away")])
 
     def call():
         for failure in failures:
@@ -130,9 +130,9 @@ def test_a_call_is_retried_until_it_works(said):
 
 def test_with_no_time_left_the_error_is_raised(said):
     def call():
-        raise NoConnection("away")
+        raise TrackingError("away")
 
-    with pytest.raises(NoConnection):
+    with pytest.raises(TrackingError):
         retry(call, "the results", 0, said.append)
     assert said == []
 
