@@ -1,11 +1,12 @@
 """`make shares`: what becomes of a swarm of which one robot, a quarter, half or all learn.
 
 Policies are trained with the preset `best` and so many learning robots, in one process, and each is then played at
-every share in the same worlds. What was trained and played is kept (`--runs-dir`), and a command that is given again
-goes on. Cells tell the share of the learning robots whose group reaches its goal; `all`, that of the worlds in which
-every one of them does; `hit`, the share that ends in a collision. FL-ORCA and the method's rule play the same worlds.
-Differences are paired, by world: the mean over the trainings, less that of the trainings at `one`. `--goal` gives
-M_sensor sectors that face the goal (`sector_frame`), whose direction its state does not hold.
+every share in the same worlds. Where more than one learns, no rule teaches: it would follow its group. What was
+trained and played is kept (`--runs-dir`), and a command that is given again goes on. Cells tell the share of the
+learning robots whose group reaches its goal; `all`, that of the worlds in which every one of them does; `hit`, the
+share that ends in a collision. FL-ORCA and the method's rule play the same worlds. Differences are paired, by world:
+the mean over the trainings, less that of the trainings at `one`. `--goal` gives M_sensor sectors that face the goal
+(`sector_frame`), whose direction its state does not hold.
 """
 
 import argparse
@@ -116,6 +117,8 @@ class Study(NamedTuple):
         settings = ["--preset", "best", "--method", self.method, "--robots", robots, "--groups", groups]
         settings += ["--learners", learners, "--seed", str(seed), "--engine", "process", "--experiment", EXPERIMENT]
         settings += ["--final-eval-episodes", str(FINAL_WORLDS)]
+        if learners != ONE_LEARNER:
+            settings += ["--teacher", "none"]  # a rule that follows its group: where all do, nobody leads
         if self.faces_goal:
             settings += ["--sector-frame", "goal", "--random-turns", "False"]
         return trained(self.options.runs_dir, f"{self.name}-{learners}-{seed}", settings)

@@ -55,6 +55,7 @@ def test_trainings_differ_in_their_share_and_are_kept_by_name(study, monkeypatch
     for learners in SHARES:
         study.train(learners, 1)
     assert list(asked) == [f"sensor-3x2-{learners}-1" for learners in SHARES]
+    assert ["--teacher" in settings for settings in asked.values()] == [share != "one" for share in SHARES]
     settings = asked["sensor-3x2-0.25-1"]
     assert settings[settings.index("--learners") + 1] == "0.25" and "--sector-frame" not in settings
 
