@@ -194,9 +194,9 @@ class TrainingLoop:
         return self.env_steps + expected >= self._config.total_env_steps
 
     def _start_updates(self) -> None:
-        """Starts calls of updates, as far as the pacer allows; each samples, updates, and publishes the weights."""
+        """Starts updates, as far as the pacer allows; each message samples, updates, and publishes the weights."""
         while self._in_flight.count(LEARNER) < self._most_in_flight(self._limits.updates_in_flight):
-            updates = self._pacer.updates_due()
+            updates = self._pacer.updates_due(self._calls_of_a_message())
             if not updates:
                 self._pacer.record_wait(to_insert=False)
                 return
@@ -204,12 +204,36 @@ class TrainingLoop:
             config, take = self._config, self._progress.record_updates
             schedules = (config.learning_rate_at, config.importance_exponent_at, config.teacher_weight_at)
             rate, exponent, weight = (schedule(self.env_steps) for schedule in schedules)
-            self._start(self._supervisor.learner, LearnerNode.update, take, updates, rate, exponent, weight)
+            arguments = (updates, rate, exponent, weight)
+            self._start(self._supervisor.learner, LearnerNode.update, take, *arguments, asked_for=updates)
 
-    def _start(self, placed: Placed[N], method: Callable[[N, *Ts], T], take: Callable[[T], None], *args: *Ts) -> None:
-        """Starts a call of a component; `take` is called with the result once it is there."""
+    def _calls_of_a_message(self) -> int:
+        """Calls of updates that a message may ask for; prioritised ones are one by one, as each sets priorities."""
+        call_s = self._progress.update_s * self._config.updates_per_call
+        if not call_s or self._config.replay == "prioritised":
+            return 1
+        return max(1, int(self._limits.message_s / call_s))
+
+    def _start(
+        self,
+        placed: Placed[N],
+        method: Callable[[N, *Ts], T],
+        take: Callable[[T], None],
+        *args: *Ts,
+        asked_for: int = 0,
+    ) -> None:
+        """Starts a call of a component; `take` is called with the result once it is there.
+
+        Args:
+          placed: the component.
+          method: what is called, with `args`.
+          take: takes the result.
+          args: see `method`.
+          asked_for: updates.
+        """
         ref = self._calls.start(placed.node, method, *args)
-        self._in_flight.add(PendingCall(method.__name__, placed.component, placed.incarnation, ref, take))
+        call = PendingCall(method.__name__, placed.component, placed.incarnation, ref, take, asked_for)
+        self._in_flight.add(call)
 
     def _start_evaluation_if_due(self) -> None:
         if self._checkpoints.is_wanted and self._is_evaluating():
@@ -255,7 +279,7 @@ class TrainingLoop:
 
     def _take_failure(self, call: PendingCall[Any], failure: ComponentFailed) -> None:
         if call.component == LEARNER:
-            self._pacer.undo_sample(self._config.updates_per_call)
+            self._pacer.undo_sample(call.updates)
         self._recover(failure)
 
     def _recover(self, failure: ComponentFailed) -> None:

@@ -15,12 +15,14 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, NoReturn
 
-from actors.rollout.foreign_env import EnvInterrupted, ForeignVectorEnv
+from actors.rollout.entry_point_env import EntryPointVectorEnv
+from actors.rollout.foreign_env import CheckedVectorEnv, EnvInterrupted, ForeignVectorEnv
 
 SIGNAL = signal.SIGUSR1
 """Ends a call of an environment, also one that sleeps or waits."""
 CALLERS = ("_make", "_spaces_of", "_first_observation", "step", "render", "close_extras")
-CALLS = {getattr(ForeignVectorEnv, name).__code__ for name in CALLERS}
+KINDS = (ForeignVectorEnv, EntryPointVectorEnv)
+CALLS = {vars(kind)[name].__code__ for kind in (CheckedVectorEnv, *KINDS) for name in CALLERS if name in vars(kind)}
 """Code of the methods that call an environment."""
 
 

@@ -48,8 +48,8 @@ class EnvInterrupted(BaseException):
     """Ends a call of an environment that takes too long; user code that catches `Exception` lets it through."""
 
 
-class ForeignVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArray[Any]]):
-    """Environments of one Gymnasium id, one after the other; each restarts in the step that ends its episode.
+class CheckedVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDArray[Any]]):
+    """What the two kinds of foreign vector environments have in common: how they check numbers, and tell of errors.
 
     Args:
       env_id: the id.
@@ -57,8 +57,70 @@ class ForeignVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDA
       render_mode: of all of them; None draws nothing.
 
     Attributes:
-      envs: the environments.
-      steps: that each of them has made.
+      envs: the objects whose code is not ours.
+      steps: that each environment has made.
+    """
+
+    def __init__(self, env_id: str, num_envs: int, render_mode: str | None = None) -> None:
+        self.env_id, self.num_envs, self.render_mode = env_id, num_envs, render_mode
+        self.steps = 0
+        self.envs: list[Any] = []
+
+    def _set_spaces(self, space: gym.spaces.Box, actions: gym.spaces.Discrete) -> None:
+        """Sets the spaces of one environment, observations flattened, and of all."""
+        self.single_observation_space, self.single_action_space = space, actions
+        self.observation_space = batch_space(space, self.num_envs)
+        self.action_space = batch_space(actions, self.num_envs)
+        self._shape = (self.num_envs, *np.shape(space.low))
+        self._is_float = space.dtype.kind == "f"
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Closes every environment; what one does instead is of no use to anybody."""
+        for env in self.envs:
+            try:
+                env.close()
+            except KeyboardInterrupt:
+                raise
+            except BaseException:
+                logging.getLogger(__name__).debug("env_id %r cannot be closed", self.env_id, exc_info=True)
+
+    def __del__(self) -> None:
+        """Does nothing: an environment's code runs only when it is called."""
+
+    def _raised(self, doing: str, error: BaseException) -> BaseException:
+        """The error of a call that raised `error`; that itself, if it is not the environment's."""
+        if isinstance(error, (KeyboardInterrupt, ConfigError)):
+            return error
+        place = _place(error)
+        if isinstance(error, EnvInterrupted):
+            what = f"{doing}() has not come back{place} within {error}"
+        elif isinstance(error, SystemExit):
+            what = f"{doing}() ended the process with exit code {error.code}{place}"
+        elif doing == "make":
+            what = f"it {CANNOT_BE_MADE}: {reason_of(error)}{place}"
+        else:
+            what = f"{doing}() raised {reason_of(error)}{place}"
+        return self._refused(what, error)
+
+    def _check_finite(self, observation: NDArray[Any], reward: NDArray[np.float64] | None = None) -> None:
+        """Refuses numbers that are not finite in float32."""
+        if reward is not None and not _are_finite(reward):
+            raise self._refused(f"step() gave the reward {_first_bad(reward)}, which is not finite in float32")
+        if self._is_float and not _are_finite(observation):
+            raise self._refused(
+                f"it gave an observation with {_first_bad(observation)}, which is not finite in float32"
+            )
+
+    def _refused(self, what: str, error: BaseException | None = None) -> EnvError:
+        when = f" at its step {self.steps:,}" if self.steps else ""
+        return EnvError(f"env_id {self.env_id!r}{when}: {what}", "" if error is None else _trace(error))
+
+
+class ForeignVectorEnv(CheckedVectorEnv):
+    """Environments of one Gymnasium id, one after the other; each restarts in the step that ends its episode.
+
+    Args:
+      env_id, num_envs, render_mode: see CheckedVectorEnv.
 
     Raises:
       EnvError: the id is unknown, the environment cannot be made, or its spaces are none that a run can have.
@@ -67,27 +129,21 @@ class ForeignVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDA
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(self, env_id: str, num_envs: int, render_mode: str | None = None) -> None:
-        self.env_id, self.num_envs, self.render_mode = env_id, num_envs, render_mode
-        self.steps = 0
-        self.envs: list[gym.Env[Any, Any]] = []
+        super().__init__(env_id, num_envs, render_mode)
         for _ in range(num_envs):
             self.envs.append(self._make())
         (space, actions), *others = map(self._spaces_of, self.envs)
         if not isinstance(actions, gym.spaces.Discrete) or actions.start != 0:
             raise self._refused(f"it must have Discrete actions from 0, not {shown(actions)}")
         try:
-            self.single_observation_space = flat_space(space)
+            flat = flat_space(space)
         except Unfit as unfit:
             raise self._refused(f"it has {unfit}") from None
         if any(spaces != (space, actions) for spaces in others):
             raise self._refused("it has other spaces each time that it is made")
         self.metadata = self._metadata_of(self.envs[0]) | type(self).metadata
-        self._encode = make_encoder(space, self.single_observation_space)
-        self.single_action_space = actions
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(actions, num_envs)
-        self._shape = (num_envs, *np.shape(self.single_observation_space.low))
-        self._is_float = self.single_observation_space.dtype.kind == "f"
+        self._encode = make_encoder(space, flat)
+        self._set_spaces(flat, actions)
 
     def _make(self) -> gym.Env[Any, Any]:
         given: dict[str, Any] = {} if self.render_mode is None else {"render_mode": self.render_mode}
@@ -170,36 +226,8 @@ class ForeignVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDA
         except BaseException as error:
             raise self._raised("render", error) from error
 
-    def close_extras(self, **kwargs: Any) -> None:
-        """Closes every environment; what one does instead is of no use to anybody."""
-        for env in self.envs:
-            try:
-                env.close()
-            except KeyboardInterrupt:
-                raise
-            except BaseException:
-                logging.getLogger(__name__).debug("env_id %r cannot be closed", self.env_id, exc_info=True)
-
-    def __del__(self) -> None:
-        """Does nothing: an environment's code runs only when it is called."""
-
     def _empty(self) -> NDArray[Any]:
         return np.zeros(self._shape, self.single_observation_space.dtype)
-
-    def _raised(self, doing: str, error: BaseException) -> BaseException:
-        """The error of a call that raised `error`; that itself, if it is not the environment's."""
-        if isinstance(error, (KeyboardInterrupt, ConfigError)):
-            return error
-        place = _place(error)
-        if isinstance(error, EnvInterrupted):
-            what = f"{doing}() has not come back{place} within {error}"
-        elif isinstance(error, SystemExit):
-            what = f"{doing}() ended the process with exit code {error.code}{place}"
-        elif doing == "make":
-            what = f"it {CANNOT_BE_MADE}: {reason_of(error)}{place}"
-        else:
-            what = f"{doing}() raised {reason_of(error)}{place}"
-        return self._refused(what, error)
 
     def _first_observation(self, i: int, **kwargs: Any) -> NDArray[Any]:
         try:
@@ -234,19 +262,6 @@ class ForeignVectorEnv(gym.vector.VectorEnv[NDArray[Any], NDArray[np.int64], NDA
         if array is None or array.dtype.kind not in "biu" or array not in (0, 1):
             raise self._refused(f"step() gave {shown(value)} where terminated and truncated must be True or False")
         return bool(array)
-
-    def _check_finite(self, observation: NDArray[Any], reward: NDArray[np.float64] | None = None) -> None:
-        """Refuses numbers that are not finite in float32."""
-        if reward is not None and not _are_finite(reward):
-            raise self._refused(f"step() gave the reward {_first_bad(reward)}, which is not finite in float32")
-        if self._is_float and not _are_finite(observation):
-            raise self._refused(
-                f"it gave an observation with {_first_bad(observation)}, which is not finite in float32"
-            )
-
-    def _refused(self, what: str, error: BaseException | None = None) -> EnvError:
-        when = f" at its step {self.steps:,}" if self.steps else ""
-        return EnvError(f"env_id {self.env_id!r}{when}: {what}", "" if error is None else _trace(error))
 
 
 def _what_step_gave(result: Any) -> str:

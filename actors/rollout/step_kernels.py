@@ -32,6 +32,7 @@ class StepLog(NamedTuple):
     reward: NDArray[np.float64]
     terminated: NDArray[np.bool_]
     done: NDArray[np.bool_]
+    decided: NDArray[np.bool_]
     length_steps: NDArray[np.int32]
     episode_return: NDArray[np.float64]
 
@@ -50,7 +51,7 @@ def record_step(
     """Writes an env step to row `step` of the log.
 
     Args:
-      log: StepLog, changed in place.
+      log: StepLog, changed in place, but for `decided`: an episode is as long as it has steps that are.
       step: number of the step in the block.
       action, reward, terminated, truncated: `[num_envs]`, of the step.
       length_steps, episode_return: `[num_envs]`, of the present episodes so far; changed in place, 0 where one ended.
@@ -63,7 +64,7 @@ def record_step(
         done = terminated[env] or truncated[env]
         log.action[step, env], log.reward[step, env] = action[env], reward[env]
         log.terminated[step, env], log.done[step, env] = terminated[env], done
-        length_steps[env] += 1
+        length_steps[env] += log.decided[step, env]
         episode_return[env] += reward[env]
         log.length_steps[step, env], log.episode_return[step, env] = length_steps[env], episode_return[env]
         if done:

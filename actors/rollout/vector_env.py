@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.rollout.entry_point_env import EntryPointVectorEnv, foreign_rollout_env
 from actors.rollout.env_spec import EnvSpec
 from actors.rollout.foreign_env import ForeignVectorEnv, rehearse_env
 from actors.rollout.joined_env import JoinedVectorEnv
@@ -37,9 +38,20 @@ def make_vector_env(spec: EnvSpec, num_envs: int) -> gym.vector.VectorEnv[Any, A
     return ForeignVectorEnv(spec.env_id, num_envs)
 
 
+def make_rollout_env(spec: EnvSpec, num_envs: int) -> gym.vector.VectorEnv[Any, Any, Any]:
+    """As `make_vector_env`, but environments that are not ours step together where their id allows that.
+
+    Those may need no seed each, and restart one step later (`EntryPointVectorEnv`).
+
+    Raises:
+      ConfigError: see `make_vector_env`.
+    """
+    return make_vector_env(spec, num_envs) if spec.is_swarm else foreign_rollout_env(spec.env_id, num_envs)
+
+
 def num_worlds_of(env: gym.vector.VectorEnv[Any, Any, Any]) -> int:
-    """Environments that have a seed each: worlds, of which a learning robot is a row."""
-    return env.num_worlds if isinstance(env, SwarmVectorEnv | JoinedVectorEnv) else env.num_envs
+    """What has a seed each: worlds, of which a learning robot is a row; environments that step together have one."""
+    return env.num_worlds if isinstance(env, SwarmVectorEnv | JoinedVectorEnv | EntryPointVectorEnv) else env.num_envs
 
 
 def reset_seeded(env: gym.vector.VectorEnv[Any, Any, Any], seeds: list[int]) -> NDArray[Any]:

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.policy.policy import Policy, WeightsSnapshot
+from actors.rollout.entry_point_env import EntryPointVectorEnv
 from actors.rollout.env_spec import EnvSpec
 from actors.rollout.exploration import draw_random_actions
 from actors.rollout.joined_env import JoinedVectorEnv
 from actors.rollout.nstep import NStepAssembler
 from actors.rollout.step_kernels import StepLog, explore, record_step
-from actors.rollout.vector_env import final_observations, make_vector_env, num_worlds_of, reset_seeded, spaces_of
+from actors.rollout.vector_env import final_observations, make_rollout_env, num_worlds_of, reset_seeded, spaces_of
 from actors.service.messages import (
     NO_OUTCOME,
     SCHEMA_VERSION,
@@ -76,11 +77,11 @@ class RolloutWorker:
         self._incarnation = incarnation
         self._sequence = 0
         self._made = 0
-        self._env = make_vector_env(settings.env, settings.num_envs)
+        self._env = make_rollout_env(settings.env, settings.num_envs)
         shape = spaces_of(self._env)
         self._num_actions = shape.num_actions
         self._num_envs = num_envs = self._env.num_envs
-        self._may_wait = max(settings.env.learners()) > 1
+        self._may_wait = max(settings.env.learners()) > 1 or isinstance(self._env, EntryPointVectorEnv)
         self._dtype = packed_dtype(transition_dtype(shape.observation_space))
         seeds = np.random.SeedSequence((settings.seed, worker_id, incarnation))
         env_seeds, policy_seed = seeds.spawn(2)
@@ -89,7 +90,7 @@ class RolloutWorker:
         self._steps = steps = self._nstep.room(settings.steps_per_block)
         size = steps.done.shape
         self._ended = ended = EpisodeStats(np.zeros(size, np.int8), np.zeros(size, np.int32), np.zeros(size))
-        written = steps.action, steps.reward, steps.terminated, steps.done
+        written = steps.action, steps.reward, steps.terminated, steps.done, steps.decided
         self._log, self._record = StepLog(*written, ended.length_steps, ended.episode_return), StateKernel(record_step)
         self._length = np.zeros(num_envs, np.int32)
         self._return = np.zeros(num_envs, np.float64)
@@ -153,10 +154,10 @@ class RolloutWorker:
         action = explore(self._greedy(policy), random_actions)
         observation, reward, terminated, truncated, infos = self._env.step(action)
         told = action, reward, terminated, truncated
-        any_ended = self._record(self._log, i, *told, self._length, self._return)
-        steps.observation[i] = self._observation
         if self._may_wait:
             steps.decided[i] = infos.get("decided", True)
+        any_ended = self._record(self._log, i, *told, self._length, self._return)
+        steps.observation[i] = self._observation
         self._observation = observation
         done = steps.done[i]
         if i + 1 == len(steps.done):
@@ -169,10 +170,10 @@ class RolloutWorker:
                 self._ended.length_steps[i] = final["episode_length"]
 
     def _greedy(self, policy: Policy) -> NDArray[np.int64]:
-        """The policy's actions `[num_envs]`; 0 for robots that wait for their world's end, which take none."""
+        """The policy's actions `[num_envs]`; 0 where no action is taken until an episode begins."""
         if not self._may_wait:
             return policy.greedy(self._observation)
-        assert isinstance(self._env, SwarmVectorEnv | JoinedVectorEnv)
+        assert isinstance(self._env, SwarmVectorEnv | JoinedVectorEnv | EntryPointVectorEnv)
         return policy.greedy(self._observation, ~self._env.waiting())
 
     def close(self) -> None:

@@ -54,7 +54,9 @@ PUSHES_IN_FLIGHT = 2
 COLLECTS_IN_FLIGHT = 2
 """Collects that a worker may have in flight, so that it never waits for the driver."""
 UPDATES_IN_FLIGHT = 2
-"""Calls of updates that the learner may have in flight, so that it never waits for the driver."""
+"""Messages that ask the learner for updates that may be in flight, so that it never waits for the driver."""
+MESSAGE_S = 0.02
+"""How long the updates of one message may take, where as many are due: a message costs the learner a millisecond."""
 INNER_SHARE = 0.3
 """Share of the deadline that nodes give each other, so that a node that waits twice in a row is not itself late."""
 RAYLET = "raylet"
@@ -88,11 +90,12 @@ class LearnerActor(LearnerNode):
     """
 
     def __init__(self, config: RunConfig, shape: EnvShape, shards: list[Handle[ShardNode]], calls: RayCalls) -> None:
+        prefetch = config.replay == "uniform"
         if shards:
-            super().__init__(config, shape, shards, calls, prefetch=config.replay == "uniform")
+            super().__init__(config, shape, shards, calls, prefetch)
         else:
             embedded = [local_handle(ShardNode(shard)) for shard in shard_settings(config, shape)]
-            super().__init__(config, shape, embedded, LocalCalls())
+            super().__init__(config, shape, embedded, LocalCalls(), prefetch)
 
 
 def cpus_needed(config: RunConfig) -> int:
@@ -294,6 +297,7 @@ class RayCluster(Cluster):
             blocks_in_flight=config.workers * (COLLECTS_IN_FLIGHT + PUSHES_IN_FLIGHT),
             updates_in_flight=UPDATES_IN_FLIGHT,
             eval_tasks=cluster_cpus(),
+            message_s=MESSAGE_S,
         )
         calls = RayCalls(max(options.deadline_s, options.start_deadline_s))
         self._spare_workers = Spares(options.spares, self._start_spare_worker)

@@ -55,7 +55,8 @@ class Limits(NamedTuple):
 
     A component is late once it owes an answer for `deadline_s`, or for `start_deadline_s` if it has never answered.
     `collects_in_flight` counts collects per rollout worker, `blocks_in_flight` the blocks of all workers that are
-    ordered and not yet stored, `updates_in_flight` calls of updates, `eval_tasks` the tasks of one final evaluation.
+    ordered and not yet stored, `updates_in_flight` messages that ask for updates, `eval_tasks` the tasks of one final
+    evaluation. A message asks for as many calls of updates as take `message_s` together, and for one at least.
     """
 
     deadline_s: float
@@ -64,6 +65,7 @@ class Limits(NamedTuple):
     blocks_in_flight: int
     updates_in_flight: int
     eval_tasks: int
+    message_s: float = 0.0
 
     @property
     def queue_deadline_s(self) -> float:

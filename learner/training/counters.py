@@ -10,7 +10,7 @@ from learner.tracking.journal import ACCOUNT
 from learner.training.ledger import Ledger
 from learner.training.meters import Meters
 from learner.training.pacing import Pacer, PacingState
-from learner.update.learner_node import UpdateReport
+from learner.update.learner_node import UPDATES, UpdateReport
 
 
 class Progress:
@@ -23,11 +23,13 @@ class Progress:
 
     Attributes:
       env_steps, updates: so far.
+      update_s: seconds that the learner took for an update, by its last report; 0 before the first.
     """
 
     def __init__(self, config: RunConfig, pacer: Pacer, ledger: Ledger) -> None:
         self.env_steps = 0
         self.updates = 0
+        self.update_s = 0.0
         self.pacer = pacer
         self.ledger = ledger
         self.meters = Meters()
@@ -46,8 +48,9 @@ class Progress:
 
     def record_updates(self, report: UpdateReport) -> None:
         """Counts a call of updates."""
-        self.meters.record_updates(report, report.version - self.updates)
-        self.updates = report.version
+        made, self.updates = report.version - self.updates, report.version
+        self.meters.record_updates(report, made)
+        self.update_s = report.seconds.get(UPDATES, 0.0) / max(made, 1)
 
     def take_due(self, event: str) -> bool:
         """True once per interval of `event` ("log", "eval" or "checkpoint"); advances its deadline."""

@@ -21,6 +21,7 @@ class PendingCall(NamedTuple, Generic[T]):
       component, incarnation: who makes the call.
       ref: refers to its result.
       take: is called with the result.
+      updates: how many are asked for, if any are.
     """
 
     method: str
@@ -28,6 +29,7 @@ class PendingCall(NamedTuple, Generic[T]):
     incarnation: int
     ref: Ref[T]
     take: Callable[[T], None]
+    updates: int = 0
 
 
 class InFlight:

@@ -71,11 +71,17 @@ class Pacer:
         inserted, sampled = self.state.inserted + expected, self.state.sampled
         return inserted * self._samples_per_insert - sampled - self.state.written_off
 
-    def updates_due(self) -> int:
-        """Updates to start now: `updates_per_call`, or 0 if sampling has to wait."""
-        if self.state.inserted < self._min_replay:
+    def updates_due(self, calls: int = 1) -> int:
+        """Updates to start now, those of as many calls as may start one after the other; 0 if sampling has to wait.
+
+        Args:
+          calls: the most.
+        """
+        ahead = self._diff() - self._min_diff
+        if self.state.inserted < self._min_replay or ahead < 0:
             return 0
-        return self._updates_per_call if self._diff() >= self._min_diff else 0
+        due = 1 + int(ahead // (self._batch_size * self._updates_per_call))
+        return min(calls, due) * self._updates_per_call
 
     def record_insert(self, rows: int) -> None:
         """Counts stored transitions."""

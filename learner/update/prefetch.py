@@ -12,9 +12,10 @@ Drawn = TypeVar("Drawn")
 class Prefetch(Generic[Drawn]):
     """Draws one super-batch ahead, in a thread.
 
-    This pays where the shards are nodes of their own: the learner does not wait for their replies. Shards that the
-    learner embeds would draw no faster, since the threads share caches and memory. Prioritised shards cannot be
-    prefetched from: the next draw needs the priorities that this call of updates sets.
+    The learner then waits neither for the replies of shards that are nodes of their own, nor for draws from those that
+    it embeds: updates and draws leave Python's lock to each other. Prioritised shards cannot be prefetched from: the
+    next draw needs the priorities that this call of updates sets. In one process nothing is drawn ahead, so that runs
+    are reproducible.
 
     Rows that are stored during one call of updates can be drawn in the call after the next. No draw runs outside
     `begin` ... `settle`, so whoever stores or saves at another time has exclusive access to the shards.

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from actors.policy.network import snapshot
-from actors.rollout.vector_env import env_shape, make_vector_env
+from actors.rollout.vector_env import env_shape, make_rollout_env
 from actors.rollout.worker import RolloutWorker
 from actors.service.messages import transition_dtype
 from learner.config import RunConfig
@@ -45,7 +45,7 @@ SETUPS = (((10, 2), 1, 6), ((10, 2), 4, 2), ((10, 8), 1, 2), ((25, 8), 1, 1))
 
 
 def simulator_work(config: RunConfig, blocks: int):
-    env = make_vector_env(config.env, config.envs_per_worker)
+    env = make_rollout_env(config.env, config.envs_per_worker)
     env.reset(seed=0)
     actions = np.random.default_rng(0).integers(
         env.single_action_space.n, size=(blocks * config.steps_per_block, config.envs_per_worker)

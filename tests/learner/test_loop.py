@@ -72,6 +72,46 @@ def test_a_checkpoint_waits_for_one_call_of_each_component(small_run, tmp_path, 
     assert len(begun) >= 5 and max(begun) == 1
 
 
+@pytest.mark.parametrize(("message_s", "replay"), [(0.0, "uniform"), (1e9, "uniform"), (1e9, "prioritised")])
+def test_a_message_asks_for_the_updates_that_are_due_within_its_time(small_run, tmp_path, message_s, replay):
+    """Where none fits, and with priorities, one call of updates; the first message cannot know how long one takes."""
+    block, asked, failed = small_run.block_env_steps, [], []
+    config = dataclasses.replace(
+        small_run,
+        total_env_steps=40 * block,
+        min_replay=block,
+        samples_per_insert=8.0,
+        replay=replay,
+        updates_per_call=2,
+    )
+    update = LearnerNode.update
+
+    def note(node, updates, *more):
+        asked.append(updates)
+        return update(node, updates, *more)
+
+    def tenth_fails(node, method):
+        if method != "update" or len(asked) != 9 or failed:
+            return None
+        failed.append(method)
+        return "unreachable before"
+
+    with closing(Journal(tmp_path / "m.jsonl", 0)) as journal, pytest.MonkeyPatch.context() as patch:
+        cluster = run_ahead(config, FailingCalls(tenth_fails))
+        cluster.limits = cluster.limits._replace(message_s=message_s)
+        loop = TrainingLoop(config, cluster, journal, tmp_path / "checkpoints", Silent(), bool)
+        patch.setattr(LearnerNode, "update", note)
+        note.__name__ = "update"
+        patch.setattr(loop, "_recover", lambda failure: None)  # the samples that failed are drawn by others
+        assert loop.run()
+    assert failed and asked[0] == config.updates_per_call
+    assert not any(updates % config.updates_per_call for updates in asked)
+    assert (max(asked) > config.updates_per_call) == (message_s > 0 and replay == "uniform")
+    assert loop.updates == sum(asked)
+    assert loop._pacer.state.sampled == loop.updates * config.batch_size
+    assert loop._pacer.ratio() == pytest.approx(8.0, rel=0.1)
+
+
 def test_a_run_that_diverges_keeps_its_last_finite_checkpoint_and_names_it(small_run, tmp_path):
     """The learning rate is sane for two checkpoints, and then is not."""
     block = small_run.block_env_steps

@@ -157,6 +157,18 @@ def test_a_stalled_learner_stops_the_workers_and_the_other_way_round():
     assert calls == 4 and pacer.state.sampled == 200  # 360 - 200 = 160 is below 200
 
 
+@given(setup=setups, seed=st.integers(0, 99), most=st.integers(1, 9))
+@settings(max_examples=60, deadline=None)
+def test_calls_that_start_together_are_those_that_may_start_one_after_the_other(setup, seed, most):
+    pacer, alone = simulate(setup, 1, seed, 60), Pacer(*setup)
+    pacer.record_insert(7 * setup.block_rows)
+    alone.state, started = pacer.state, 0
+    while started < most and alone.updates_due():
+        alone.record_sample(alone.updates_due())
+        started += 1
+    assert pacer.updates_due(most) == started * setup.updates_per_call
+
+
 def test_nothing_is_sampled_before_min_replay():
     pacer = Pacer(*Setup(4.0, 100, 1, 1, 1, 1))
     pacer.record_insert(99)
