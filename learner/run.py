@@ -24,7 +24,7 @@ from actors.rollout.vector_env import env_shape
 from actors.rollout.worker import select_stats
 from actors.service.fault_policy import STEADY_CALLS, CallFailed, ComponentFailed, FaultTracker, RunFailed, first_line
 from actors.service.messages import EpisodeStats
-from actors.service.rpc import Calls
+from actors.service.rpc import Calls, LocalCalls
 from actors.storage.full_disk import DISK_TIMEOUT_S, is_disk_full, is_full
 from actors.storage.uri import Location, join_location
 from learner.checkpoints.checkpoint import Checkpoint, check_config, check_state, newest_valid
@@ -235,12 +235,14 @@ class RunSession:
         return self._patiently(begin, "the policy")
 
     def _evaluate(self, end: RunEnd, calls: Calls, max_calls: int) -> None:
-        """Plays the final episodes that are missing, in parallel tasks that need no component of the run.
+        """Plays the final episodes that are missing, here or in parallel tasks, which need no component of the run.
 
         Raises:
           RunFailed: a task fails again and again.
         """
         num_calls = worthwhile_calls(self._config.env, self._config.final_eval_episodes, max_calls)
+        if self._plays_here:
+            calls, num_calls = LocalCalls(), 1
 
         def play(spec: EnvSpec, weights: WeightsSnapshot) -> EpisodeStats:
             return evaluate_in_parallel(calls, spec, calls.put(weights), final_seeds(self._config), num_calls)
@@ -256,6 +258,16 @@ class RunSession:
                 f"the evaluation{whose} at the end {failure.fault} again and again: {failure.reason}"
             ) from failure
 
+    @property
+    def _plays_here(self) -> bool:
+        """Whether this process plays the final episodes itself: another one would hardly play before this one is done.
+
+        A user's own method or scene is played in a task, which has a deadline.
+        """
+        config = self._config
+        is_ours = config.env.is_swarm and not any(world.sources for world in config.env.worlds)
+        return is_ours and worthwhile_calls(config.env, config.final_eval_episodes, 2) == 1
+
     def _make_end(self, end: RunEnd, more_steps: MoreSteps, stop: StopRequest) -> RunResult:
         """Makes the steps of the end that are missing; returns the run's result.
 
@@ -263,7 +275,8 @@ class RunSession:
           RunFailed: a step cannot be made now.
         """
         if end.episodes() is None:
-            with open_calls(self._config, self._options) as (calls, max_calls):
+            local = nullcontext[tuple[Calls, int]]((LocalCalls(), 1))
+            with local if self._plays_here else open_calls(self._config, self._options) as (calls, max_calls):
                 stop.listen(STOPPING)
                 self._evaluate(end, calls, max_calls)
         result, rows = self._result(end), self._deliver_all(end)

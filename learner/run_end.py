@@ -21,6 +21,7 @@ from actors.rollout.vector_env import env_shape
 from actors.rollout.worker import join_stats
 from actors.service.messages import EpisodeStats
 from learner.config import RunConfig
+from learner.export.saved_policy import read_saved_policy, save_policy
 from learner.file_names import END_STATE, POLICY
 from learner.run_folder import write_json
 
@@ -72,11 +73,9 @@ class RunEnd:
     @classmethod
     def begin(cls, folder: Path, config: RunConfig, state: EndState, weights: WeightsSnapshot) -> RunEnd:
         """Stores what the end works from; from then on no env step is made again."""
-        from learner.export.policy_file import save_policy  # here, since it imports torch
-
         discard_end(folder)
         folder.mkdir()
-        save_policy(folder / POLICY, weights, config, env_shape(config.env))
+        save_policy(folder / POLICY, weights)
         end = cls(folder, config, state, weights)
         end._save(state)
         return end
@@ -88,8 +87,6 @@ class RunEnd:
             state = EndState(**json.loads((folder / END_STATE).read_text()))
             if state.env_steps < config.total_env_steps:
                 return None
-            from learner.export.policy_file import read_saved_policy  # here, since it imports torch
-
             return cls(folder, config, state, read_saved_policy(folder / POLICY, config, env_shape(config.env)))
         except (OSError, ValueError, TypeError):
             return None

@@ -20,10 +20,11 @@ from learner.checkpoints.checkpoint import read_checkpoint
 from learner.checkpoints.manifest import MANIFEST
 from learner.checkpoints.store import FolderStore
 from learner.config import RunConfig, config_hash, to_dict
-from learner.export.policy_file import read_policy, read_saved_policy
+from learner.export.policy_file import read_policy
 from learner.export.ports import FRAME, Port, bare_inputs, bare_outputs
 from learner.export.reference_states import Sensed, observed_states, swarm_states
 from learner.export.robot_module import BarePolicy, make_robot, robot_class
+from learner.export.saved_policy import read_saved_policy
 from learner.export.write import Agreement, check_packages, write_export
 from learner.run_folder import RunFolder, find_run
 from learner.tracking.mlflow_run import git_commit

@@ -8,6 +8,7 @@ from deploy.console.terminal import plain_console
 from learner.checkpoints.checkpoint import Checkpoint, best_valid, finished_names, newest_valid, valid_named
 from learner.checkpoints.retention import scores_of
 from learner.config import RunConfig
+from learner.export.saved_policy import read_saved_policy
 from learner.run_folder import RunFolder
 from learner.tracking.journal import read_rows
 from sim_core.checks import ConfigError
@@ -27,13 +28,13 @@ def find_policy(folder: RunFolder, config: RunConfig, which: str = NEWEST) -> We
     Raises:
       CheckpointError: there is no such policy, or it does not fit.
     """
-    from learner.export.policy_file import read_policy, read_saved_policy  # here, since it imports torch
-
     shape = env_shape(config.env)
     is_swept = folder.results.is_file() or not (folder.checkpoints.exists() or folder.storage().checkpoint_url)
     is_named = which not in (NEWEST, BEST)
     if folder.policy.is_file() and is_swept and not is_named:  # a finished cell keeps its policy alone
         return read_saved_policy(folder.policy, config, shape)
+    from learner.export.policy_file import read_policy  # here, since it imports torch
+
     return read_policy(_checkpoint(folder, which), config, shape)
 
 

@@ -26,7 +26,7 @@ from actors.service.messages import EpisodeStats
 from learner.checkpoints.checkpoint import Checkpoint
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig
-from learner.export.policy_file import read_saved_policy, save_policy
+from learner.export.saved_policy import read_saved_policy, save_policy
 from learner.file_names import EVALUATIONS
 from learner.run import RunResult, RunSession, Step, last_checkpoint
 from learner.run_end import RunEnd, discard_end, final_seeds
@@ -188,7 +188,7 @@ def _train(
         shape = env_shape(cell.config.env)
 
         def log_file() -> None:
-            save_policy(folder.policy, weights, cell.config, shape)
+            save_policy(folder.policy, weights)
             tracker.log_artifact(folder.policy)
 
         def log_policy() -> None:

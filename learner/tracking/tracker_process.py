@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
 
 OPEN, LOAD_END = "open", "load_end"
 """The calls that make the process's tracker, and that load what it needs at the end; all others are the tracker's."""
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that stop a run."""
 ENDS_S = 5.0
 """How long the process may take to end."""
 
@@ -52,7 +55,7 @@ class MlflowProcess:
     def __init__(self) -> None:
         self._socket, theirs = socket.socketpair()
         with theirs:
-            # In a process group of its own: Ctrl-C in a terminal ends the run, whose last rows go through this process.
+            # In a process group of its own, which a terminal does not send its signals to.
             self._process = subprocess.Popen(
                 module_order("learner.tracking.tracker_process", [str(theirs.fileno())]),
                 stdin=subprocess.DEVNULL,
@@ -173,8 +176,11 @@ class TrackerProcess(TrackedRun):
                     self._process.begin(OPEN, self.uri, None, None).result()
                     if self.run_id:
                         self._process.begin("rejoin", self.run_id).result()
-                except ConfigError as error:
-                    raise TrackingError(str(error)) from error
+                except BaseException as error:  # also Ctrl-C: a process that does not know the run must not stay
+                    self._process.close()
+                    if isinstance(error, ConfigError):
+                        raise TrackingError(str(error)) from error
+                    raise
             return self._process
 
     def start(self, config: RunConfig) -> None:
@@ -278,7 +284,12 @@ def _load_stores() -> None:
 
 
 def _serve(connection: Connection[Any, Any]) -> None:
-    """Answers calls, each in a thread, until the other process has closed the connection, or has died."""
+    """Answers calls, each in a thread, until the other process has closed the connection, or has died.
+
+    What stops a run does not stop this process: the run's last rows and its end go through it.
+    """
+    for number in STOPS:
+        signal.signal(number, signal.SIG_IGN)
     desk, pool = _Desk(connection), ThreadPoolExecutor()
     pool.submit(_load_stores)
     with suppress(EOFError, OSError):

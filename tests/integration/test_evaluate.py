@@ -20,7 +20,7 @@ from actors.rollout.vector_env import env_shape
 from deploy.cli import main
 from deploy.commands import evaluate as playing
 from deploy.commands.evaluate import episodes_path
-from learner.export.policy_file import save_policy
+from learner.export.saved_policy import save_policy
 from learner.presets import preset_config
 from learner.run_folder import RunFolder
 from sim_core import ENV_ID
@@ -49,7 +49,7 @@ def make_run(name="r", **changes):
     shape = env_shape(config.env)
     torch.manual_seed(0)
     network = QNetwork(shape.observation_size, config.hidden_sizes, shape.num_actions)
-    save_policy(run.policy, snapshot(network, 77, 0.0), config, shape)
+    save_policy(run.policy, snapshot(network, 77, 0.0))
     return run, config, snapshot(network, 77, 0.0)
 
 

@@ -12,7 +12,8 @@ import pytest
 from actors.rollout.vector_env import env_shape
 from deploy.cli import main
 from learner.checkpoints.checkpoint import newest_valid
-from learner.export.policy_file import read_policy, save_policy
+from learner.export.policy_file import read_policy
+from learner.export.saved_policy import save_policy
 from learner.run_folder import RunFolder
 from tests.integration.conftest import SMALL, flags
 
@@ -55,7 +56,7 @@ def test_a_run_its_checkpoint_and_a_kept_policy_are_the_same_export(finished, ex
     folder = RunFolder(finished)
     config = folder.config()
     checkpoint, _ = newest_valid(folder.checkpoints)
-    save_policy(folder.policy, read_policy(checkpoint, config, env_shape(config.env)), config, env_shape(config.env))
+    save_policy(folder.policy, read_policy(checkpoint, config, env_shape(config.env)))
     expected = np.load(exported / "golden.npz")
     for name, source in {"checkpoint": checkpoint.folder, "policy": folder.policy}.items():
         assert export(str(source), "--out", str(tmp_path / name)) == 0

@@ -1,6 +1,8 @@
 """A session of a run: its attempts, what it logs, and the status with which it ends the MLflow run."""
 
 import dataclasses
+from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,8 +11,10 @@ import pytest
 from actors.rollout.vector_env import env_shape
 from actors.service.fault_policy import Component, ComponentFailed, ComponentKind, Fault, RunFailed
 from actors.service.messages import EpisodeStats
+from actors.service.rpc import LocalCalls
 from learner.cluster_options import ClusterOptions
 from learner.run import RunSession, Step
+from learner.run_end import EndState, RunEnd
 from learner.run_folder import RunFolder
 from learner.tracking.tracked_run import TrackingError
 from learner.training.cluster import ProcessCluster
@@ -19,6 +23,7 @@ from learner.update.learner import Learner
 from sim_core.outcomes import Outcome
 
 LOST = ComponentFailed(Component(ComponentKind.LEARNER), 4, Fault.DIED, "simulated")
+COMPASS = Path(__file__).parents[2] / "deploy" / "examples" / "compass.py"
 EPISODES = EpisodeStats(np.full(2, Outcome.GOAL), np.ones(2, np.int32), np.ones(2))
 
 
@@ -45,6 +50,14 @@ class FakeTracker:
 
     def end(self, status):
         self.status = status
+
+
+@pytest.fixture
+def user_method(tmp_path):
+    """A method in a file of a user's own."""
+    path = tmp_path / "mine.py"
+    path.write_text(COMPASS.read_text())
+    return f"{path}:Compass"
 
 
 class Messages(list):
@@ -150,3 +163,32 @@ def test_artifacts_that_mlflow_refuses_fail_the_run_which_can_be_resumed(session
     assert session.tracker.status == "FAILED"
     assert session.execute(None, no_steps).evaluation is not None and session.incarnations == [0], "nothing is trained"
     assert session.tracker.status == "FINISHED" and len(session.tracker.results) == 1
+
+
+@pytest.mark.parametrize(("episodes", "method", "opens"), [(2, "sensor", 0), (8_000, "sensor", 1), (2, "user", 1)])
+def test_a_session_plays_a_short_evaluation_of_ours_itself(
+    episodes, method, opens, tmp_path, small_run, monkeypatch, user_method
+):
+    opened, called = [], []
+
+    @contextmanager
+    def open_calls(config, options):
+        opened.append(config)
+        yield LocalCalls(), 2
+
+    def play(calls, *arguments):
+        called.append(calls)
+        return EpisodeStats(*(np.resize(field, episodes if len(field) else 0) for field in EPISODES))
+
+    monkeypatch.setattr("learner.run.open_calls", open_calls)
+    monkeypatch.setattr("learner.run.evaluate_in_parallel", play)
+    world = small_run.world if method == "sensor" else dataclasses.replace(small_run.world, method=user_method)
+    config = dataclasses.replace(small_run, engine="ray", final_eval_episodes=episodes, world=world)
+    weights = Learner(config, env_shape(config.env)).weights(0.0)
+    folder = RunFolder(tmp_path / "r")
+    folder.path.mkdir()
+    folder.journal.touch()
+    RunEnd.begin(folder.end, config, EndState(config.total_env_steps, 0, 0, None, []), weights)
+    tracker = FakeTracker()
+    RunSession(folder, config, tracker, Messages(), ClusterOptions()).execute(None, no_steps)
+    assert len(opened) == opens and len(called) == 1 and tracker.begun == 0

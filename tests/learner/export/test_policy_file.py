@@ -9,7 +9,8 @@ from actors.rollout.vector_env import env_shape
 from learner.checkpoints.checkpoint import Checkpoint
 from learner.checkpoints.manifest import CheckpointError
 from learner.config import RunConfig
-from learner.export.policy_file import read_policy, read_saved_policy, save_policy
+from learner.export.policy_file import read_policy
+from learner.export.saved_policy import read_saved_policy, save_policy
 from learner.training.cluster import ProcessCluster
 from sim_core.config import WorldConfig
 from tests import checkpointing
@@ -31,7 +32,7 @@ def test_a_dueling_policy_is_kept_as_the_plain_network_that_it_equals(tmp_path, 
     config = dataclasses.replace(small_run, network="dueling", hidden_sizes=(9, 8))
     shape, learner = env_shape(config.env), ProcessCluster(config, 0).learner
     weights = learner.weights()
-    save_policy(tmp_path / "policy.safetensors", weights, config, shape)
+    save_policy(tmp_path / "policy.safetensors", weights)
     again = read_saved_policy(tmp_path / "policy.safetensors", config, shape)
     checkpoint = checkpoint_of(learner, tmp_path)
     kept = read_policy(checkpoint, config, shape)

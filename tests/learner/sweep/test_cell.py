@@ -17,7 +17,7 @@ from actors.rollout.vector_env import env_shape
 from actors.storage.fragment_writer import sync_all
 from learner.checkpoints.checkpoint import finished_names
 from learner.checkpoints.manifest import CheckpointError
-from learner.export.policy_file import read_saved_policy
+from learner.export.saved_policy import read_saved_policy
 from learner.run_folder import RunFolder
 from learner.sweep.cell import SweepLocation, run_cell
 from learner.sweep.grid import Cell, SweepConfig, cell_hash

@@ -7,6 +7,7 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
+from unittest.mock import Mock
 
 import mlflow
 import psutil
@@ -17,7 +18,7 @@ from learner.tracking.begin_tracking import TrackingStart
 from learner.tracking.journal import Row
 from learner.tracking.mlflow_run import Tracker
 from learner.tracking.tracked_run import TrackingError
-from learner.tracking.tracker_process import MlflowProcess, TrackerProcess
+from learner.tracking.tracker_process import OPEN, MlflowProcess, TrackerProcess
 from learner.update.learner import Learner
 from sim_core.checks import ConfigError
 
@@ -122,9 +123,33 @@ def test_a_process_that_dies_before_the_store_is_open_is_told(uri):
             tracker.opened()
 
 
-def test_ctrl_c_in_a_terminal_does_not_reach_the_process():
-    with closing(MlflowProcess()) as process:
-        assert os.getpgid(process.pid) == process.pid != os.getpgid(0)
+def test_signals_that_stop_a_run_do_not_stop_the_process(uri, small_run, tmp_path):
+    with opened(uri, tmp_path) as tracker:
+        assert os.getpgid(tracker.pid) == tracker.pid != os.getpgid(0), "a terminal signals the run's group"
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            os.kill(tracker.pid, number)
+        before = tracker.pid
+        tracker.start(small_run)
+        tracker.end("KILLED")
+        assert tracker.pid == before
+
+
+def test_an_interrupt_while_another_process_starts_leaves_none_that_does_not_know_the_run(
+    uri, small_run, tmp_path, monkeypatch
+):
+    with opened(uri, tmp_path) as tracker:
+        tracker.start(small_run)
+        kill(tracker.pid)
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            begin = MlflowProcess.begin
+            interrupt = Mock(side_effect=KeyboardInterrupt)
+            patch.setattr(
+                MlflowProcess, "begin", lambda self, *call: interrupt() if call[0] == OPEN else begin(self, *call)
+            )
+            tracker.push(rows(0, 1))
+        tracker.push(rows(0, 2))
+        tracker.end("KILLED")
+        assert logged(tracker) == [0, 100]
 
 
 def test_the_process_ends_with_the_one_that_started_it():
