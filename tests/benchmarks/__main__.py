@@ -42,7 +42,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         "--picture", action="store_true", help="`scaling` draws the picture of the model in this folder's README anew"
     )
     parser.add_argument("--against", type=Path, metavar="PATH", help="`startup`: another checkout to compare with")
-    parser.add_argument("--rounds", type=int, default=3, help="`startup`: how often everything runs; default: 3")
+    parser.add_argument(
+        "--rounds", type=int, default=3, help="`startup`, `service`: how often everything runs; default: 3"
+    )
     options = parser.parse_args(arguments)
     for name in options.names:
         if name not in BENCHMARKS:
@@ -63,6 +65,8 @@ def main() -> int:
             simulator.main(options.sections, [path.resolve() for path in options.rvo2])
         elif name == "startup":
             importlib.import_module("tests.benchmarks.startup").main(options.against, options.rounds)
+        elif name == "service":
+            importlib.import_module("tests.benchmarks.service").main(options.rounds)
         elif name == "scaling":
             importlib.import_module("tests.benchmarks.scaling").main(options.picture)
         else:  # imported here, as their libraries take seconds that the simulator's processes need not wait

@@ -1,4 +1,7 @@
-"""Where the CPU time of a training over Ray goes: py-spy's samples of its processes, sorted by what they are for."""
+"""Where the CPU time of an update goes in a training over Ray: py-spy's samples of its processes, by what they are for.
+
+An update stands for all that belongs to it: the env steps whose transitions it samples, and its share of the messages.
+"""
 
 import dataclasses
 import subprocess
@@ -8,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -19,20 +22,22 @@ from rich.table import Table
 from learner.config import RunConfig
 from tests.benchmarks.processes import processes_of_the_run
 from tests.benchmarks.ray_service import ENDLESS, WARM_S, ray_service
-from tests.benchmarks.service import SAMPLES_PER_INSERT
+from tests.benchmarks.service import SAMPLES_PER_INSERT, learner_work, limited_configs
+from tests.benchmarks.timing import spread, stopwatch, timed_rates
 from tests.checkpointing import Silent
 
 SECONDS, RATE_HZ = 30, 100
+BARE_ROUNDS = 5
 SPY = Path(sysconfig.get_path("scripts")) / "py-spy"
 PARTS = ("driver", "rollout worker", "learner")
 RAY = "Ray"
-Shares = dict[tuple[str, str], float]
-"""Of each process and work, the share of all CPU time."""
+Costs = dict[tuple[str, str], float]
+"""Of each process and work, CPU time in microseconds an update."""
 Samples = dict[int, Counter[str]]
 """Of each thread, by its id, how often it was seen at what."""
 WORK = (
-    ("simulation", ("sim_core/",)),
-    ("policy", ("actors/policy/network.py", "actors/policy/mlp_kernels.py", "actors/rollout/exploration.py")),
+    ("simulation", ("sim_core/", "gymnasium/", "actors/rollout/entry_point_env.py")),
+    ("policy", ("actors/policy/", "actors/rollout/exploration.py")),
     (
         "updates",
         (
@@ -43,7 +48,15 @@ WORK = (
         ),
     ),
     ("replay", ("actors/replay/", "actors/service/packing.py", "actors/storage/ring_snapshot.py")),
-    ("transitions and blocks", ("actors/rollout/worker.py", "actors/rollout/nstep.py", "actors/rollout/vector_env.py")),
+    (
+        "transitions and blocks",
+        (
+            "actors/rollout/worker.py",
+            "actors/rollout/nstep.py",
+            "actors/rollout/step_kernels.py",
+            "actors/rollout/vector_env.py",
+        ),
+    ),
     ("training loop", ("learner/", "actors/", "tests/")),
     (RAY, ("ray/", "<frozen")),
 )
@@ -117,59 +130,73 @@ def spent_on(thread_s: dict[int, float], samples: Samples) -> Counter[str]:
 
 
 class Spy(threading.Thread):
-    """Looks at the run's processes once it is steady."""
+    """Looks at the run's processes once it is steady.
 
-    def __init__(self) -> None:
+    Args:
+      updates: tells how many the run has made.
+    """
+
+    def __init__(self, updates: Callable[[], int]) -> None:
         super().__init__(daemon=True)
-        self.shares: Shares = {}
+        self._updates = updates
+        self.costs: Costs = {}
         self.trouble = ""
 
     def run(self) -> None:
         time.sleep(WARM_S)
         processes = {kind: process for kind, process in processes_of_the_run() if kind in PARTS}
-        before = thread_seconds()
+        before, made = thread_seconds(), self._updates()
         try:
             samples = spied(processes, SECONDS)
         except RuntimeError as error:
             self.trouble = str(error)
             return
         spent: Counter[tuple[str, str]] = Counter()
-        for kind, after in thread_seconds().items():
+        now, made = thread_seconds(), self._updates() - made
+        for kind, after in now.items():
             earlier = before.get(kind, {})
             thread_s = {thread: after[thread] - earlier.get(thread, 0.0) for thread in after}
             spent.update({(kind, work): value for work, value in spent_on(thread_s, samples.get(kind, {})).items()})
-        self.shares = {part: value / spent.total() for part, value in spent.most_common()}
+        self.costs = {part: 1e6 * value / made for part, value in spent.most_common()}
 
 
-def shares_of(config: RunConfig) -> Shares:
-    """Shares of the CPU time of a training, by process and work, the largest first."""
-    spy = Spy()
+def costs_of(config: RunConfig) -> Costs:
+    """CPU time of an update, by process and work, the most first."""
+    spies: list[Spy] = []
     with ray_service(config) as make_loop:
 
         def stop() -> bool:
-            if loop.updates and spy.ident is None:
-                spy.start()
-            return spy.ident is not None and not spy.is_alive()
+            if loop.updates and not spies:
+                spies.append(Spy(lambda: loop.updates))
+                spies[0].start()
+            return bool(spies) and not spies[0].is_alive()
 
         loop = make_loop(Silent(), stop)
         loop.run()
-    if spy.trouble:
-        sys.exit(spy.trouble)
-    return spy.shares
+    if spies[0].trouble:
+        sys.exit(spies[0].trouble)
+    return spies[0].costs
 
 
 def main() -> None:
-    found = [
-        shares_of(dataclasses.replace(RunConfig(**ENDLESS), samples_per_insert=samples))
+    swarm = {
+        f"10r×2g, {samples:g} samples per insert": dataclasses.replace(RunConfig(**ENDLESS), samples_per_insert=samples)
         for samples in SAMPLES_PER_INSERT
-    ]
-    table = Table(title="CPU time of a training of 10r×2g M_sensor, one rollout worker and learner")
+    }
+    configs = swarm | {name: config for name, config in limited_configs().items() if name.startswith("CartPole")}
+    found = [costs_of(config) for config in configs.values()]
+    table = Table(title="CPU time of an update and of all that belongs to it, microseconds")
     for column in ("process", "what it does"):
         table.add_column(column)
-    for samples in SAMPLES_PER_INSERT:
-        table.add_column(f"{samples:g} samples per insert", justify="right")
-    for part in found[0]:
-        shares = [of_run.get(part, 0.0) for of_run in found]
-        if max(shares) >= 0.005:
-            table.add_row(*part, *(f"{share:.1%}" for share in shares))
-    Console(width=120).print(table)
+    for name in configs:
+        table.add_column(name, justify="right")
+    parts = list(dict.fromkeys(part for costs in found for part in costs))
+    for part in parts:
+        spent = [costs.get(part, 0.0) for costs in found]
+        if any(value >= 0.005 * sum(costs.values()) for value, costs in zip(spent, found, strict=True)):
+            table.add_row(*part, *(f"{value:.1f}" for value in spent))
+    table.add_row("all", "", *(f"{sum(costs.values()):.1f}" for costs in found))
+    works = {name: stopwatch(learner_work(config), time.process_time) for name, config in configs.items()}
+    bare = [1e6 / spread(rates).median for rates in timed_rates(works, BARE_ROUNDS).values()]
+    table.add_row("bare learner", "updates", *(f"{value:.1f}" for value in bare))
+    Console(width=160).print(table)

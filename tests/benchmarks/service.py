@@ -1,6 +1,7 @@
 """Where the time goes: the bare simulator, the rollout worker, the learner, and the whole service over Ray."""
 
 import dataclasses
+import os
 import time
 from typing import NamedTuple
 
@@ -16,12 +17,13 @@ from learner.config import RunConfig
 from learner.training.cluster import rollout_settings
 from learner.update.learner import Learner
 from sim_core.config import WorldConfig
+from tests.benchmarks.entrants import contests
 from tests.benchmarks.ray_service import ENDLESS, Point, measured_point
-from tests.benchmarks.timing import rates, ratio, spread, stopwatch, timed_rates
+from tests.benchmarks.timing import rates, ratio, spread, stopwatch, sustained, timed_rates
 
 ROUNDS = 5
 SERVICE_S = 20.0
-SERVICE_ROUNDS = 3
+BARE_S = 2.0
 
 
 class Kind(NamedTuple):
@@ -104,12 +106,13 @@ def rollout_table() -> Table:
     return table
 
 
-def service_table(config: RunConfig) -> Table:
+def service_table(config: RunConfig, rounds: int) -> Table:
     """The service over Ray, of its bare parts, which are measured anew in every round."""
-    bare = {"simulator": simulator_work(config, 6), "learner": learner_work(config)}
+    works = {"simulator": simulator_work(config, 6), "learner": learner_work(config)}
+    bare = {name: sustained(work, BARE_S) for name, work in works.items()}
     alone: dict[str, list[float]] = {name: [] for name in bare}
     points: dict[Kind, list[Point]] = {kind: [] for kind in KINDS}
-    for _ in range(SERVICE_ROUNDS):
+    for _ in range(rounds):
         for kind in KINDS:
             for name, work in bare.items():
                 alone[name] += rates({name: work}, 1)[name]
@@ -128,7 +131,59 @@ def service_table(config: RunConfig) -> Table:
     return table
 
 
-def main() -> None:
-    console = Console(width=160)
-    for table in (rollout_table(), service_table(RunConfig(**ENDLESS))):
+def most_updates(config: RunConfig, env_steps_per_s: float, updates_per_s: float, cores: int) -> float:
+    """Updates a second of `cores` cores of which each makes so many env steps or so many updates a second."""
+    env_steps = config.batch_size / config.samples_per_insert  # for each update
+    seconds = env_steps / env_steps_per_s + 1 / updates_per_s
+    return min(updates_per_s, cores / seconds)
+
+
+def limited_configs() -> dict[str, RunConfig]:
+    """Trainings that are set beside their limit, by what they are; CartPole's are those of the peers."""
+    cartpole, cartpole475 = (contests()[name].config for name in ("cartpole", "cartpole475"))
+    found = {f"CartPole, batch {config.batch_size}": config for config in (cartpole475, cartpole)}
+    swarm = RunConfig()
+    slow = dataclasses.replace(swarm, workers=2, world=dataclasses.replace(swarm.world, decision_interval_steps=4))
+    found |= {"10r×2g": swarm, "10r×2g, a decision every 4 steps, 2 workers": slow}
+    return {name: dataclasses.replace(config, envs_per_worker=128, **ENDLESS) for name, config in found.items()}
+
+
+def limit_table(rounds: int) -> Table:
+    """The service over Ray beside what bare simulation and bare updates, measured in every round, leave time for."""
+    cores = len(os.sched_getaffinity(0))
+    table = Table(title=f"the service over Ray on {cores} cores, and its limit; median (lowest … highest)")
+    columns = ("training", "bare: env steps/s", "updates/s", "limit: updates/s", "service: updates/s", "of the limit")
+    for column in (*columns, "CPU, µs an update: learner", "workers", "driver", "Ray"):
+        table.add_column(column, justify="right")
+    for name, config in limited_configs().items():
+        bare: dict[str, list[float]] = {"simulator": [], "learner": []}
+        limits, points = [], []
+        for _ in range(rounds):
+            works = {"simulator": simulator_work(config, 2), "learner": learner_work(config)}
+            for part, work in works.items():
+                bare[part] += rates({part: sustained(work, BARE_S)}, 1)[part]
+            limits.append(most_updates(config, bare["simulator"][-1], bare["learner"][-1], cores))
+            points.append(measured_point(config, SERVICE_S))
+        updates = [point.updates_per_s for point in points]
+        share = ratio(updates, limits).text(2)
+        numbers = [spread(values).text() for values in (*bare.values(), limits, updates)]
+        table.add_row(name, *numbers, share, *cpu_of_an_update(points))
+    return table
+
+
+def cpu_of_an_update(points: list[Point]) -> list[str]:
+    """CPU time in microseconds of learner, rollout workers, driver and Ray's own processes; medians."""
+    each: list[list[float]] = [[], [], [], []]
+    for point in points:
+        known = [point.cpu_s.get(kind, 0.0) for kind in ("learner", "rollout worker", "driver")]
+        steps = point.env_steps_per_s / point.updates_per_s
+        for seconds, column in zip((*known, sum(point.cpu_s.values()) - sum(known)), each, strict=True):
+            column.append(1e6 * seconds * steps)
+    return [f"{spread(column).median:.1f}" for column in each]
+
+
+def main(rounds: int) -> None:
+    console = Console(width=200)
+    console.print(rollout_table())
+    for table in (service_table(RunConfig(**ENDLESS), rounds), limit_table(rounds)):
         console.print(table)

@@ -37,6 +37,18 @@ def rates(rivals: dict[str, Callable[[], int]], rounds: int) -> dict[str, list[f
     return timed_rates({name: stopwatch(work) for name, work in rivals.items()}, rounds)
 
 
+def sustained(work: Callable[[], int], seconds: float) -> Callable[[], int]:
+    """`work` again and again for so many seconds, so that a core's turns and pauses are in the mean."""
+
+    def repeated() -> int:
+        end_s, units = time.perf_counter() + seconds, 0
+        while time.perf_counter() < end_s:
+            units += work()
+        return units
+
+    return repeated
+
+
 def timed_rates(rivals: dict[str, Callable[[], Timed]], rounds: int) -> dict[str, list[float]]:
     """As `rates`, for rivals that hold the watch themselves."""
     found: dict[str, list[float]] = {name: [] for name in rivals}

@@ -12,9 +12,9 @@ from actors.policy.policy import Policy
 from actors.rollout.vector_env import env_shape, make_vector_env
 from learner.config import RunConfig
 from tests.benchmarks import contest, entrants, peers
-from tests.benchmarks.contenders.limit import most_updates
 from tests.benchmarks.contenders.sb3 import Vectorised
 from tests.benchmarks.contest import Finding, Heat, Lap, float_env, heat_of, policy_of, rhythm, target_every_env_steps
+from tests.benchmarks.service import most_updates
 
 CARTPOLE = entrants.contests()["cartpole"].config
 

@@ -7,19 +7,11 @@ the learner no more than one.
 import dataclasses
 import os
 
-from learner.config import RunConfig
 from tests.benchmarks.contest import Finding, Heat, compete
-from tests.benchmarks.service import learner_work, simulator_work
+from tests.benchmarks.service import learner_work, most_updates, simulator_work
 from tests.benchmarks.timing import rates, spread
 
 ROUNDS = 5
-
-
-def most_updates(config: RunConfig, env_steps_per_s: float, updates_per_s: float, cores: int) -> float:
-    """Updates a second of `cores` cores of which each makes so many env steps or so many updates a second."""
-    env_steps = config.batch_size / config.samples_per_insert  # for each update
-    seconds = env_steps / env_steps_per_s + 1 / updates_per_s
-    return min(updates_per_s, cores / seconds)
 
 
 def measure(heat: Heat) -> Finding:
