@@ -18,7 +18,6 @@ from deploy.runs.folders import (
     stamped_name,
 )
 from deploy.runs.tracking import opened_tracker
-from deploy.training import finished_at, resume_training, run_training
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig, config_hash
 from learner.engine import closed_on_error, open_cluster
@@ -65,6 +64,8 @@ def _start(folder: RunFolder, config: RunConfig, storage: Storage, launch: Launc
         opened = open_cluster(config, 0, launch.cluster_options())
     with ExitStack() as stack:
         with closed_on_error(opened):
+            from deploy.training import run_training  # here: MLflow and the components load meanwhile
+
             tracker = tracking.run()
             stack.enter_context(folder.lock())
             _check_free(folder, not folder.has_begun())  # another process may have begun it meanwhile
@@ -102,6 +103,8 @@ def _check_storage(folder: RunFolder, checkpoint_url: str | None) -> None:
 
 def _resume(folder: RunFolder, config: RunConfig, options: ClusterOptions) -> int:
     """Resumes an unfinished run; returns the exit code."""
+    from deploy.training import finished_at, resume_training
+
     require(
         config_hash(folder.config()) == config_hash(config),
         f"{folder.path} holds a run of other settings; choose another --name",

@@ -47,7 +47,7 @@ PROCESSES = {
         "import deploy.runs.artifacts",
         MEASURED - KERNELS - {"zarr", "matplotlib"},
     ),
-    "the driver": ("import deploy.commands.train, deploy.commands.resume", MEASURED - KERNELS - {"zarr"}),
+    "the driver": ("import deploy.commands.train, deploy.training", MEASURED - KERNELS - {"zarr"}),
     "the process that writes to MLflow": (
         "import sim_core, learner.tracking.mlflow_run, mlflow.store.tracking.sqlalchemy_store",
         MEASURED - {"mlflow", "pandas"},
