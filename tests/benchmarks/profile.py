@@ -28,6 +28,7 @@ from tests.checkpointing import Silent
 
 SECONDS, RATE_HZ = 30, 100
 BARE_ROUNDS = 5
+KERNELS = "sim_core/jit.py"
 SPY = Path(sysconfig.get_path("scripts")) / "py-spy"
 PARTS = ("driver", "rollout worker", "learner")
 RAY = "Ray"
@@ -67,6 +68,8 @@ def work_of(stack: str) -> str:
     """What a stack is for: its frames, `function (file:line)` from the outermost in, are joined by `;`."""
     for frame in reversed(stack.split(";")):
         path = frame.rpartition("(")[2]
+        if path.startswith(KERNELS):
+            continue  # whoever calls a kernel says what for
         for work, files in WORK:
             if path.startswith(files):
                 return work

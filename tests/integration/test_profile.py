@@ -15,6 +15,7 @@ COLLECT = f"{LOOP};RolloutNode.collect (actors/rollout/node.py:70);RolloutWorker
     [
         (f"{COLLECT};SwarmVectorEnv.step (sim_core/envs.py:187);WorldBatch.step (sim_core/worlds.py:96)", "simulation"),
         (f"{COLLECT};Policy.greedy (actors/policy/network.py:148)", "policy"),
+        (f"{COLLECT};Policy.greedy (actors/policy/policy.py:9);StateKernel.__call__ (sim_core/jit.py:60)", "policy"),
         (f"{COLLECT};_any (numpy/_core/_methods.py:61)", "transitions and blocks"),
         (
             f"{LOOP};LearnerNode.update (learner/update/learner_node.py:1);"
