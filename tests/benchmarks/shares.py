@@ -117,7 +117,7 @@ class Study(NamedTuple):
         settings += ["--learners", learners, "--seed", str(seed), "--engine", "process", "--experiment", EXPERIMENT]
         settings += ["--final-eval-episodes", str(FINAL_WORLDS)]
         if self.faces_goal:
-            settings += ["--sector-frame", "goal"]
+            settings += ["--sector-frame", "goal", "--random-turns", "False"]
         return trained(self.options.runs_dir, f"{self.name}-{learners}-{seed}", settings)
 
     def world(self) -> WorldConfig:
