@@ -16,7 +16,9 @@ method knows. One decision lasts several simulator steps: at 0.05 s one action c
 two actions differ by less than the network's error. It learns from three decisions at a time and from more samples with
 a smaller rate, and
 
-- M_sensor counts own and other robots apart: their difference hides a crowd of both;
+- M_sensor counts own and other robots apart: their difference hides a crowd of both. It looks further ahead than the
+  others (a discount of 0.985 a decision): with 0.97 it comes too late in large swarms, where only timeouts are left. It
+  acts by averaged weights and learns from turned transitions.
 - M_IN and M_OUT are rewarded for progress towards the goal inside the ellipse, not for being inside: with few robots
   the learning robot can hardly leave an ellipse that it spans, and lingers.
 - M_IN and M_OUT have a gain of the potential field of 0.05 m^4/s, which the text does not give. With the 0.15 of
@@ -24,8 +26,7 @@ a smaller rate, and
 - M_IN decides in every step: nothing but its own decisions keeps it from robots that do not avoid it.
 - M_IN and M_OUT have a rule of theirs as a teacher (`field`, `greedy`), and learn from turned transitions.
 
-`generalist` is `best` for one policy that learns all setups of the dissertation at once. M_sensor's looks further ahead
-(a discount of 0.985 a decision): with 0.97 it comes too late in large swarms, where only timeouts are left.
+`generalist` is `best` for one policy that learns all setups of the dissertation at once.
 
 What a preset sets for one method alone stands with the method (`Method.presets`).
 """
@@ -84,7 +85,9 @@ _TRAINING = {"thesis": _COMMON, "best": _BEST, "generalist": _GENERALIST}
 
 
 def preset_config(name: TrainingPreset, method: str, robots: int = 10, groups: int = 2) -> RunConfig:
-    """The settings that a preset gives one method in one setup; a method without presets takes M_sensor's.
+    """The settings that a preset gives one method in one setup.
+
+    A method without presets takes M_sensor's, except that its transitions are not turned: nothing says how its state turns.
 
     Args:
       name: the preset.
@@ -95,7 +98,9 @@ def preset_config(name: TrainingPreset, method: str, robots: int = 10, groups: i
     Raises:
       ConfigError: the method is unknown or the setup is not possible.
     """
-    presets = find(METHODS, method).presets or find(METHODS, "sensor").presets
-    training, world = presets[name]
+    own = find(METHODS, method).presets
+    training, world = (own or find(METHODS, "sensor").presets)[name]
+    if not own:
+        training = {**training, "random_turns": False}
     chosen = WorldConfig(method=method, robots=robots, groups=groups, **world)
     return RunConfig(world=chosen, **(_TRAINING[name] | training))

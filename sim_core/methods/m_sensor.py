@@ -34,6 +34,7 @@ BEST_WORLD: dict[str, Any] = {
     "decision_interval_steps": 4,
     "horizon_is": "failure",
 }
+BEST = Preset({"discount": 0.985, "policy_average_updates": 1_000, "random_turns": True}, BEST_WORLD)
 
 
 class SensorParams(NamedTuple):
@@ -156,8 +157,8 @@ class SensorMethod(Method):
     draws = frozenset({"sectors"})
     presets = {
         "thesis": Preset({"n_step": 1, "samples_per_insert": 1.5}, WORLD),
-        "best": Preset({}, BEST_WORLD),
-        "generalist": Preset({"discount": 0.985, "policy_average_updates": 1_000, "random_turns": True}, BEST_WORLD),
+        "best": BEST,
+        "generalist": BEST,
     }
     robot_module = "learner.export.m_sensor:SensorRobot"
 

@@ -1,11 +1,15 @@
 """The presets: possible in every setup, and what the text says of `thesis`."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 
+import deploy
 from actors.evaluation.result_table import GROUPS, ROBOTS
 from learner.presets import preset_config
+
+EXAMPLES = Path(deploy.__file__).parent / "examples"
 
 
 @pytest.mark.parametrize("name", ["thesis", "best"])
@@ -49,3 +53,10 @@ def test_a_generalist_learns_all_setups_in_the_world_of_best(method):
     one, other = (dataclasses.asdict(config.world) for config in (best, general))
     assert {name for name in one if one[name] != other[name]} <= {"group_rows", "apf_rows"}  # how the state is written
     assert (general.network == "pooled") == (method != "sensor")
+
+
+@pytest.mark.parametrize("name", ["thesis", "best", "generalist"])
+def test_a_method_without_presets_takes_m_sensors_and_its_transitions_are_not_turned(name):
+    own, ours = (preset_config(name, method) for method in (f"{EXAMPLES}/compass.py:Compass", "sensor"))
+    assert not own.random_turns
+    assert dataclasses.replace(own, world=ours.world, random_turns=ours.random_turns) == ours
