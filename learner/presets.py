@@ -87,7 +87,8 @@ _TRAINING = {"thesis": _COMMON, "best": _BEST, "generalist": _GENERALIST}
 def preset_config(name: TrainingPreset, method: str, robots: int = 10, groups: int = 2) -> RunConfig:
     """The settings that a preset gives one method in one setup.
 
-    A method without presets takes M_sensor's, except that its transitions are not turned: nothing says how its state turns.
+    A method without presets takes M_sensor's, except that its transitions are not turned: nothing says how its state
+    turns.
 
     Args:
       name: the preset.
