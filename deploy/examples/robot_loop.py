@@ -24,10 +24,10 @@ def load(folder: Path) -> tuple[Any, dict[str, Any]]:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     policy = onnxruntime.InferenceSession(str(folder / "policy.onnx"), options, providers=["CPUExecutionProvider"])
-    golden = np.load(folder / "golden.npz")
-    states = {name.removeprefix("in."): golden[name] for name in golden.files if name.startswith("in.")}
-    if not np.allclose(policy.run(["action_values"], states)[0], golden["out.action_values"], atol=1e-3):
-        sys.exit(f"{folder} does not answer as it should on this machine")
+    with np.load(folder / "golden.npz") as golden:
+        states = {name.removeprefix("in."): golden[name] for name in golden if name.startswith("in.")}
+        if not np.allclose(policy.run(["action_values"], states)[0], golden["out.action_values"], atol=1e-3):
+            sys.exit(f"{folder} does not answer as it should on this machine")
     return policy, json.loads((folder / "policy.json").read_text("utf-8"))
 
 
@@ -67,8 +67,7 @@ def main(folder: Path, seconds: float = 12.0, walk_m_s: float = 0.5) -> None:
         else:
             driven = velocity[0]
         spent_s += time.perf_counter() - begin_s
-        robot += driven * tick_s
-        groups += tick_s * walk[:, None]
+        robot, groups = robot + tick_s * driven, groups + tick_s * walk[:, None]
         if tick % round(1 / tick_s) == 0:
             away_m = np.linalg.norm(robot - groups[0].mean(axis=0))
             print(f"{tick * tick_s:.0f} s: drives {driven.round(2)} m/s, {away_m:.2f} m from its group")

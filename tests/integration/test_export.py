@@ -52,16 +52,22 @@ def exported(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def golden_states(folder):
+    """Arrays by name of an export's golden states."""
+    with np.load(folder / "golden.npz") as file:
+        return dict(file)
+
+
 def test_a_run_its_checkpoint_and_a_kept_policy_are_the_same_export(finished, exported, tmp_path, capsys):
     folder = RunFolder(finished)
     config = folder.config()
     checkpoint, _ = newest_valid(folder.checkpoints)
     save_policy(folder.policy, read_policy(checkpoint, config, env_shape(config.env)))
-    expected = np.load(exported / "golden.npz")
+    expected = golden_states(exported)
     for name, source in {"checkpoint": checkpoint.folder, "policy": folder.policy}.items():
         assert export(str(source), "--out", str(tmp_path / name)) == 0
-        found = np.load(tmp_path / name / "golden.npz")
-        for key in expected.files:
+        found = golden_states(tmp_path / name)
+        for key in expected:
             np.testing.assert_array_equal(found[key], expected[key])
     assert "decided" in capsys.readouterr().out
     about = json.loads((exported / "policy.json").read_text())
@@ -98,7 +104,7 @@ def test_the_example_drives_with_a_shield_where_the_policy_does(exported, tmp_pa
 
 def test_the_example_refuses_an_export_that_answers_otherwise(exported, tmp_path):
     shutil.copytree(exported, tmp_path / "e")
-    golden = dict(np.load(exported / "golden.npz"))
+    golden = golden_states(exported)
     golden["out.action_values"] += 0.1
     np.savez(tmp_path / "e" / "golden.npz", **golden)
     command = [sys.executable, "-I", str(EXAMPLE), str(tmp_path / "e")]

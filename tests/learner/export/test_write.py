@@ -128,8 +128,9 @@ def test_both_files_stop_the_robot_where_it_cannot_decide(exported):
 
 def test_golden_states_come_with_their_answers(exported):
     _, folder, _ = exported
-    golden = np.load(folder / GOLDEN, allow_pickle=False)
-    inputs = {name[3:]: golden[name] for name in golden.files if name.startswith("in.")}
+    with np.load(folder / GOLDEN, allow_pickle=False) as file:
+        golden = dict(file)
+    inputs = {name[3:]: golden[name] for name in golden if name.startswith("in.")}
     got = run_onnx(folder / ONNX, inputs)
     np.testing.assert_array_equal(got["action"], golden["out.action"])
     np.testing.assert_allclose(got["velocity"], golden["out.velocity"], atol=1e-5)
