@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import errno
 import functools
-import gc
 import importlib
 import operator
 import os
@@ -20,7 +19,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, cast, get_args
 
-gc.set_threshold(100_000, 20, 20)  # what imports make stays: to look through it again and again takes a tenth of them
+from learner.own_processes import collect_rarely
+
+collect_rarely()  # before the imports that are large
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # before numpy is imported: with more, processes compete for cores
 

@@ -23,10 +23,8 @@ from typing import NamedTuple, NoReturn
 import psutil
 
 from learner.file_names import END, END_STATE, JOURNAL
-from learner.module_order import module_order
+from learner.own_processes import STOPPING, module_order
 
-PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that the driver gets; it runs in a process group of its own, so a terminal sends them here alone."""
 RESUMES: tuple[str, ...] = ("--or-resume", "True")
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 """Of Linux's prctl."""
@@ -70,7 +68,7 @@ class Supervisor:
     def supervise(self) -> int:
         """Runs drivers until one ends by itself, or makes no progress; returns the exit code."""
         _prctl(PR_SET_CHILD_SUBREAPER, 1)  # what a killed driver leaves becomes a child of this process
-        for number in PASSED_ON:
+        for number in STOPPING:  # the driver has a process group of its own, so a terminal sends them here alone
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # as nohup wants it
                 signal.signal(number, self._pass_on)
         best, resumes = Reached(0, -1), tuple[str, ...]()

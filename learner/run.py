@@ -9,8 +9,8 @@ starts from the newest checkpoint. Once all env steps are done, a session only m
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from contextlib import AbstractContextManager, closing, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
 
@@ -34,6 +34,7 @@ from learner.config import RunConfig
 from learner.engine import open_calls, open_cluster
 from learner.file_names import CONFIG
 from learner.loop import TrainingLoop
+from learner.own_processes import STOPPING
 from learner.run_end import EndState, RunEnd, discard_end, final_seeds
 from learner.run_folder import RunFolder
 from learner.tracking.delivery import Delivery, retry
@@ -45,7 +46,7 @@ from learner.tracking.tracked_run import TrackedRun, TrackingError
 from learner.training.cluster import Cluster
 from learner.training.evaluation_summary import Evaluation, as_metrics, score, summarise
 from learner.training.recovery import RunLost
-from learner.training.stop_signals import STOPPING, StopRequest, stop_on_signals
+from learner.training.stop_signals import StopRequest, stop_on_signals
 
 T = TypeVar("T")
 
@@ -221,7 +222,8 @@ class RunSession:
                 return RunResult(loop.env_steps, loop.updates, loop.saved, stop.signal, None, None, None, {})
             end = self._begin_end(loop, journal)
             stop.check()
-            self._evaluate(end, cluster.calls, cluster.limits.eval_tasks)
+            with self._calls_to_play(cluster, stop) as (calls, max_calls):
+                self._evaluate(end, calls, max_calls)
             return end
         except ComponentFailed as failure:  # before or after the rounds of training
             raise loop.lost(failure) from failure
@@ -235,14 +237,12 @@ class RunSession:
         return self._patiently(begin, "the policy")
 
     def _evaluate(self, end: RunEnd, calls: Calls, max_calls: int) -> None:
-        """Plays the final episodes that are missing, here or in parallel tasks, which need no component of the run.
+        """Plays the final episodes that are missing by `calls`, which need no component of the run.
 
         Raises:
           RunFailed: a task fails again and again.
         """
         num_calls = worthwhile_calls(self._config.env, self._config.final_eval_episodes, max_calls)
-        if self._plays_here:
-            calls, num_calls = LocalCalls(), 1
 
         def play(spec: EnvSpec, weights: WeightsSnapshot) -> EpisodeStats:
             return evaluate_in_parallel(calls, spec, calls.put(weights), final_seeds(self._config), num_calls)
@@ -258,15 +258,27 @@ class RunSession:
                 f"the evaluation{whose} at the end {failure.fault} again and again: {failure.reason}"
             ) from failure
 
-    @property
-    def _plays_here(self) -> bool:
-        """Whether this process plays the final episodes itself: another one would hardly play before this one is done.
+    @contextmanager
+    def _calls_to_play(self, cluster: Cluster | None, stop: StopRequest) -> Iterator[tuple[Calls, int]]:
+        """Calls that play the final episodes, and how many to make at once: of this process, or else of parallel tasks.
 
-        A user's own method or scene is played in a task, which has a deadline.
+        This process plays them itself where another one would hardly play before it is done. A user's own method or
+        scene is played in a task, which has a deadline.
+
+        Args:
+          cluster: the run's components, if they still run.
+          stop: listens again once Ray has been started.
         """
         config = self._config
         is_ours = config.env.is_swarm and not any(world.sources for world in config.env.worlds)
-        return is_ours and worthwhile_calls(config.env, config.final_eval_episodes, 2) == 1
+        if is_ours and worthwhile_calls(config.env, config.final_eval_episodes, 2) == 1:
+            yield LocalCalls(), 1
+        elif cluster is not None:
+            yield cluster.calls, cluster.limits.eval_tasks
+        else:
+            with open_calls(config, self._options) as tasks:
+                stop.listen(STOPPING)  # Ray has set a handler of its own
+                yield tasks
 
     def _make_end(self, end: RunEnd, more_steps: MoreSteps, stop: StopRequest) -> RunResult:
         """Makes the steps of the end that are missing; returns the run's result.
@@ -275,9 +287,7 @@ class RunSession:
           RunFailed: a step cannot be made now.
         """
         if end.episodes() is None:
-            local = nullcontext[tuple[Calls, int]]((LocalCalls(), 1))
-            with local if self._plays_here else open_calls(self._config, self._options) as (calls, max_calls):
-                stop.listen(STOPPING)
+            with self._calls_to_play(None, stop) as (calls, max_calls):
                 self._evaluate(end, calls, max_calls)
         result, rows = self._result(end), self._deliver_all(end)
         steps = [Step("the results", partial(self._log_results, result, rows)), *more_steps(result, rows)]

@@ -31,6 +31,8 @@ from typing import Any
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, _CacheLocator
 
+from sim_core.user_cache import user_cache
+
 KERNEL_PACKAGES = ("actors", "learner")
 """The other packages with kernels. They lie beside this one."""
 ANOTHER = "NUMBA_CACHE_DIR names another folder"
@@ -52,10 +54,9 @@ def sources_digest() -> str:
 
 def _bases() -> list[Path]:
     """Folders that may hold compiled kernels, the preferred one first."""
-    chosen = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
     named = [Path(numba.config.CACHE_DIR)] if numba.config.CACHE_DIR else []
-    users = [chosen / "shoal"] if chosen.is_absolute() else []  # a user without a home has `~`
-    return [*named, *users, Path(__file__).parent / "__pycache__"]
+    users = user_cache()
+    return [*named, *([users] if users else []), Path(__file__).parent / "__pycache__"]
 
 
 def _is_usable(folder: Path) -> bool:

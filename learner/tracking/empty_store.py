@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import importlib.util
-import os
 import shutil
 import sqlite3
 import tempfile
@@ -24,6 +23,7 @@ from sqlalchemy.engine import Engine
 
 from actors.storage.atomic_write import replacing_file, sync
 from learner.tracking.local_store import database_of, sqlite_uri
+from sim_core.user_cache import user_cache
 
 MIGRATIONS = "mlflow.store.db_migrations"
 """The package whose folder `versions` has a file for each migration."""
@@ -51,8 +51,8 @@ def copy_empty_store(uri: str, open_store: OpenStore) -> None:
 
 def _template() -> Path | None:
     """Where the empty database of the present MLflow is kept; None for a user without a home."""
-    chosen = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
-    return chosen / "shoal" / f"mlflow-{_migrations_digest()}.db" if chosen.is_absolute() else None
+    folder = user_cache()
+    return folder / f"mlflow-{_migrations_digest()}.db" if folder else None
 
 
 def _migrations_digest() -> str:

@@ -8,7 +8,6 @@ starts another one, which goes on with the run.
 
 from __future__ import annotations
 
-import gc
 import itertools
 import os
 import signal
@@ -23,7 +22,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from learner.module_order import module_order
+from learner.own_processes import STOPPING, collect_rarely, module_order
 from learner.tracking.tracked_run import TrackedRun, TrackingError
 from sim_core.checks import ConfigError
 
@@ -36,8 +35,6 @@ if TYPE_CHECKING:
 
 OPEN, LOAD_END = "open", "load_end"
 """The calls that make the process's tracker, and that load what it needs at the end; all others are the tracker's."""
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that stop a run."""
 ENDS_S = 5.0
 """How long the process may take to end."""
 
@@ -289,9 +286,9 @@ def _serve(connection: Connection[Any, Any]) -> None:
 
     What stops a run does not stop this process: the run's last rows and its end go through it.
     """
-    for number in STOPS:
+    for number in STOPPING:
         signal.signal(number, signal.SIG_IGN)
-    gc.set_threshold(100_000, 20, 20)  # what imports make stays: to look through it takes a sixth of MLflow's
+    collect_rarely()
     desk, pool = _Desk(connection), ThreadPoolExecutor()
     pool.submit(_load_stores)
     with suppress(EOFError, OSError):

@@ -10,10 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that stop a run; SIGHUP comes from a terminal that is closed, or a connection that is lost."""
-
-
 AGAIN_S = 0.1
 """Time after which a process is interrupted again where an interruption came to nothing."""
 

@@ -7,7 +7,8 @@ import weakref
 
 import pytest
 
-from learner.training.stop_signals import STOPPING, Interrupted, stop_on_signals
+from learner.own_processes import STOPPING
+from learner.training.stop_signals import Interrupted, stop_on_signals
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
 

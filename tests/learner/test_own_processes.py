@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from learner.module_order import module_order
+from learner.own_processes import module_order
 
 
 @pytest.mark.parametrize(("first", "options"), [("", ["-m"]), (".", ["-m"]), ("/elsewhere", ["-P", "-m"])])
