@@ -92,6 +92,14 @@ class _Unsaved:
         return {}
 
 
+def _trace_of(trial: Any) -> str:
+    """What ended a trial. Tune has written it to its own folder; the copy that `get_error` reads may come later."""
+    trace = ""
+    with suppress(OSError, TypeError):  # TypeError: there is no such file
+        trace = Path(trial.error_file).read_text("utf-8", "replace")
+    return trace or "its process died"
+
+
 class _Callback(_Unsaved, tune.Callback):
     """Passes Tune's events to a CellListener, and writes the traceback of a cell's last crash to its folder."""
 
@@ -114,7 +122,7 @@ class _Callback(_Unsaved, tune.Callback):
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         if trial.status != "ERROR":
             return
-        key, trace = trial.config["cell"], str(trial.get_error() or "its process died")
+        key, trace = trial.config["cell"], _trace_of(trial)
         path = self._location.cells / key / TRACE
         with suppress(OSError):  # the disk may be full, which may be why the cell failed
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -258,7 +266,7 @@ class _TrialCallback(_Unsaved, tune.Callback):
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         if trial.status == "ERROR":
-            self._source.failed(trial.config["number"], str(trial.get_error() or "its process died"))
+            self._source.failed(trial.config["number"], _trace_of(trial))
 
 
 def _run_trial(params: dict[str, Any], work: Work) -> None:
