@@ -2,8 +2,8 @@
 
 For every method, trainings of the preset `generalist` in three setups with several seeds: `clean`; `drawn`, with
 conditions drawn for every episode (domain randomisation); `drawn, history`, which also sees what it sensed before; and
-`drawn, tracked`, which takes robots that it does not sense any more to go on with their last velocity; and the same with
-a shield, which keeps ORCA's half-planes against the robots that it takes to be there. All policies and rules then meet
+`drawn, tracked`, which takes robots that it does not sense any more to go on with their last velocity; `drawn, tracked,
+shield`, which keeps ORCA's half-planes against the robots that it takes to be there, too. All policies and rules then meet
 the same start scenes under each condition by itself. Differences are paired: an episode's mean over the trainings, less
 that of `clean` without any condition. A player breaks where its success falls to 50 %.
 """
@@ -28,6 +28,7 @@ from deploy.console.summary_tables import signed_percent
 from deploy.options.results import Stress
 from deploy.playing.players import find_players
 from deploy.playing.stress_results import StressResults
+from learner.run_folder import RunFolder
 from sim_core.plugins import DISSERTATION_METHODS, METHODS, find
 from tests.benchmarks.trainings import trained
 
@@ -80,18 +81,23 @@ def run_name(method: str, kind: str, seed: int) -> str:
     return f"{method}-{kind.replace(', ', '-')}-{seed}"
 
 
-def train(method: str, options: argparse.Namespace) -> list[str]:
-    """Names of all trainings, which are made unless they are there, and of the rules."""
+def training(method: str, kind: str, seed: int, settings: tuple[str, ...], options: argparse.Namespace) -> RunFolder:
+    """The run of one training of the preset `generalist` in `SETUPS`, which is made unless it is there."""
     steps = str(ENV_STEPS)
     common = ["--preset", "generalist", "--method", method, "--engine", "process", "--setups", *SETUPS]
     common += ["--total-env-steps", steps, "--learning-rate-decay-env-steps", steps]
     common += ["--eval-every-env-steps", steps, "--checkpoint-every-env-steps", steps]
+    name = run_name(method, kind, seed)
+    return trained(options.runs_dir, name, [*common, "--seed", str(seed), *settings, *options.train])
+
+
+def train(method: str, options: argparse.Namespace) -> list[str]:
+    """Names of all trainings, which are made unless they are there, and of the rules."""
     names = []
     for seed in options.seeds:
         for kind, settings in KINDS.items():
             names.append(run_name(method, kind, seed))
-            folder = trained(options.runs_dir, names[-1], [*common, "--seed", str(seed), *settings, *options.train])
-    world = folder.config().world
+            world = training(method, kind, seed, settings, options).config().world
     return [*names, *(str(rule) for rule in (Baseline.GREEDY, Baseline.FIELD, Baseline.FL_ORCA) if exists(rule, world))]
 
 

@@ -1,0 +1,97 @@
+"""What learning as a unicycle gains: policies trained so, beside policies trained as a holonomic robot, and the rules.
+
+For every method, trainings of the preset `generalist` in three setups with several seeds, with either robot; then all
+drive a unicycle in the same start scenes.
+
+python -m tests.benchmarks.unicycle_learned
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from actors.evaluation.evaluator import Candidate
+from actors.evaluation.statistics import mean
+from actors.policy.baselines import Baseline, exists
+from actors.rollout.env_spec import EnvSpec
+from deploy.console.summary_tables import signed_percent
+from deploy.runs.policy_lookup import find_policy
+from sim_core import ENV_ID
+from sim_core.outcomes import Outcome
+from sim_core.plugins import DISSERTATION_METHODS, METHODS, find
+from tests.benchmarks.robustness import CLEAN, FADES, training
+
+TURN_DEG_S, ACCELERATION_M_S2 = 180.0, 2.0
+HOLONOMIC, TRAINED = "trained as a holonomic robot", "trained as a unicycle"
+DRIVING = (
+    *("--kinematics", "unicycle", "--turn-rate-limit-deg-s", str(TURN_DEG_S)),
+    *("--acceleration-limit-m-s2", str(ACCELERATION_M_S2)),
+)
+RULES = (Baseline.GREEDY, Baseline.FIELD, Baseline.FL_ORCA)
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.unicycle_learned", description=__doc__)
+    parser.add_argument("--methods", nargs="+", choices=DISSERTATION_METHODS, default=list(DISSERTATION_METHODS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of the trainings")
+    parser.add_argument("--episodes", type=int, default=1_000, help="per player and setup")
+    parser.add_argument("--first-seed", type=int, default=2_000_000_000, help="of the episodes")
+    parser.add_argument(
+        "--runs-dir", type=Path, default=Path("runs/robustness"), help="finished trainings are kept, here and there"
+    )
+    parser.add_argument("train", nargs="*", help="after --: settings of the trainings, as of `shoal train`")
+    return parser.parse_args(arguments)
+
+
+def outcomes(method: str, options: argparse.Namespace) -> dict[str, dict[str, np.ndarray]]:
+    """By setup and player: the outcomes `[trainings, episodes]` of driving a unicycle; of a rule `[1, episodes]`."""
+    kinds = {HOLONOMIC: (CLEAN, ()), TRAINED: ("unicycle", (*DRIVING, *FADES))}
+    runs = {
+        player: [training(method, kind, seed, settings, options) for seed in options.seeds]
+        for player, (kind, settings) in kinds.items()
+    }
+    from learner.ray_backend.cluster import evaluate_in_tasks  # imports Ray, which `shoal train` configures first
+
+    config = runs[TRAINED][0].config()
+    worlds = config.env.worlds
+    players: dict[str, list[Candidate]] = {
+        name: [find_policy(folder, folder.config()) for folder in folders] for name, folders in runs.items()
+    } | {str(rule): [rule] for rule in RULES if exists(rule, config.world)}
+    seeds = list(range(options.first_seed, options.first_seed + options.episodes))
+    unicycles = [EnvSpec(ENV_ID, world) for world in worlds]
+    found: dict[str, dict[str, np.ndarray]] = {world.setup: {} for world in worlds}
+    for name, members in players.items():
+        played = [evaluate_in_tasks(unicycles, member, seeds, None) for member in members]
+        for place, world in enumerate(worlds):
+            found[world.setup][name] = np.array([stats[place].outcome for stats in played])
+    return found
+
+
+def main(arguments: list[str] | None = None) -> int:
+    options = parse(arguments)
+    limits = f"{TURN_DEG_S:.0f}°/s, {ACCELERATION_M_S2:.0f} m/s²"
+    table = Table(
+        title=f"success (and collisions) of a unicycle of {limits}: {len(options.seeds)} trainings, "
+        f"{options.episodes} episodes a setup"
+    )
+    for name in ("method", "setup", "player", "success", "trained as a unicycle is better by"):
+        table.add_column(name, justify="left" if name in ("method", "setup", "player") else "right")
+    for method in options.methods:
+        for setup, players in outcomes(method, options).items():
+            goals = {name: (found == Outcome.GOAL).mean(axis=0) for name, found in players.items()}
+            for name, found in players.items():
+                crashed = float((found == Outcome.COLLISION).mean())
+                gained = "" if name == TRAINED else signed_percent(mean(goals[TRAINED] - goals[name]))
+                success = f"{100 * goals[name].mean():.1f} % ({100 * crashed:.1f})"
+                table.add_row(find(METHODS, method).label, setup, name, success, gained)
+            table.add_section()
+    Console(width=150).print(table)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
