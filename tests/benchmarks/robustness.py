@@ -3,7 +3,7 @@
 For every method, trainings of the preset `generalist` in three setups with several seeds: `clean`; `drawn`, with
 conditions drawn for every episode (domain randomisation); `drawn, history`, which also sees what it sensed before; and
 `drawn, tracked`, which takes robots that it does not sense any more to go on with their last velocity; `drawn, tracked,
-shield`, which keeps ORCA's half-planes against the robots that it takes to be there, too. All policies and rules then meet
+shield`, which keeps ORCA's half-planes against the robots that it takes to be there too. All policies and rules meet
 the same start scenes under each condition by itself. Differences are paired: an episode's mean over the trainings, less
 that of `clean` without any condition. A player breaks where its success falls to 50 %.
 """
