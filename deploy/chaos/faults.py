@@ -9,7 +9,8 @@ from rich.table import Table
 
 from learner.tracking.fault_log import DRIVER, FaultEntry
 
-MLFLOW = "MLflow server"
+MLFLOW, TRACKER = "MLflow server", "MLflow process"
+"""The server, and the process of the run that writes to it."""
 KILLED, FROZEN, DELAYED, FULL = "killed", "frozen", "delayed", "with a full disk"
 TRANSIENT = (DELAYED, FULL)
 """Actions that end by themselves; the process is not replaced."""
@@ -30,6 +31,7 @@ KINDS = (
     FaultKind(KILLED, "learner", 2),
     FaultKind(KILLED, DRIVER, 2),
     FaultKind(KILLED, MLFLOW, 2),
+    FaultKind(KILLED, TRACKER, 2),
     FaultKind(FROZEN, "rollout worker", 1),
     FaultKind(FROZEN, "replay shard", 1),
     FaultKind(FROZEN, "learner", 1),

@@ -10,7 +10,7 @@ import psutil
 from rich.console import Console
 
 from deploy.chaos.config import CONFIG, NAME
-from deploy.chaos.faults import DELAYED, FULL, KILLED, KINDS, MLFLOW, TRANSIENT, FaultKind, InjectedFault
+from deploy.chaos.faults import DELAYED, FULL, KILLED, KINDS, MLFLOW, TRACKER, TRANSIENT, FaultKind, InjectedFault
 from deploy.chaos.processes import Driver, TrackingServer, fill_disk
 from deploy.options.training import Chaos
 from learner.checkpoints.checkpoint import finished_names
@@ -41,7 +41,7 @@ class ChaosRun:
       server: its MLflow server.
       driver: the process of `shoal train` or `shoal resume`.
       injected: faults of the run's processes so far.
-      outages: finished outages of the MLflow server, with their recovery times.
+      outages: finished outages of the MLflow server, or of the process that writes to it, with their recovery times.
     """
 
     def __init__(self, command: Chaos, console: Console) -> None:
@@ -54,7 +54,7 @@ class ChaosRun:
         self.injected: list[InjectedFault] = []
         self.outages: list[InjectedFault] = []
         self._server_back_s = 0.0
-        self._outage: tuple[float, int] | None = None
+        self._outage: tuple[InjectedFault, int] | None = None
         self._pending_ends: list[tuple[float, Callable[[], None]]] = []
         self._checkpoints_at_setback: set[str] | None = set()
         self._drawn: tuple[FaultKind, float] | None = None
@@ -113,13 +113,9 @@ class ChaosRun:
     def _inject(self) -> bool:
         """Injects one fault; returns whether there was a victim."""
         kind, now_s = self._draw(), time.time()
-        if kind.victim == MLFLOW:
-            if self._outage is not None:
+        if kind.victim in (MLFLOW, TRACKER):
+            if not self._cut_off_mlflow(kind, now_s):
                 return False
-            self.server.kill()
-            self._outage = (now_s, PushedMark.value(self.folder.pushed))
-            self._server_back_s = now_s + OUTAGE_S
-            self._print(kind)
         elif kind.victim == DRIVER:
             self._kill_driver(kind, now_s)
         else:
@@ -129,6 +125,21 @@ class ChaosRun:
             self._apply(kind, self._rng.choice(victims))
             self._record(kind, now_s)
         self._drawn = None
+        return True
+
+    def _cut_off_mlflow(self, kind: FaultKind, now_s: float) -> bool:
+        """Kills the MLflow server, or the process that writes to it; returns whether there was one to kill."""
+        if self._outage is not None:
+            return False
+        if kind.victim == MLFLOW:
+            self.server.kill()
+            self._server_back_s = now_s + OUTAGE_S
+        elif writers := self.driver.children(TRACKER):
+            self._apply(kind, writers[0])
+        else:
+            return False
+        self._outage = (InjectedFault(kind, now_s), PushedMark.value(self.folder.pushed))
+        self._print(kind)
         return True
 
     def _kill_driver(self, kind: FaultKind, now_s: float) -> None:
@@ -174,15 +185,15 @@ class ChaosRun:
                 continue
 
     def _follow_outage(self) -> None:
-        """Restarts the MLflow server when its outage is over; the outage ends once new rows have been delivered."""
+        """Restarts a killed MLflow server in time; an outage ends once new rows have been delivered."""
         if self._outage is None:
             return
         if self._server_back_s and time.time() >= self._server_back_s:
             self._server_back_s = 0.0
             self.server.start_again()
-        since_s, mark = self._outage
+        fault, mark = self._outage
         if PushedMark.value(self.folder.pushed) > mark or self.driver.exit_code() == 0:
-            self.outages.append(InjectedFault(FaultKind(KILLED, MLFLOW, 0), since_s, time.time() - since_s))
+            self.outages.append(fault._replace(recovery_s=time.time() - fault.time_s))
             self._outage = None
 
     def end(self) -> None:

@@ -26,8 +26,10 @@ TITLES = {
     "replay shard": ("ray::ShardNode", "ray::SpareShard.add", "ray::SpareShard.sample"),
     "learner": ("ray::LearnerActor",),
     "evaluation": ("ray::evaluate",),
+    "MLflow process": ("learner.tracking.tracker_process",),
 }
-"""How Ray's process titles of each kind of component begin; those of a spare that has taken a place, too."""
+"""How a word of the command line of each kind of process begins: Ray's titles, also of a spare that has taken a place,
+or a module."""
 
 
 def free_port() -> int:
@@ -120,14 +122,14 @@ class Driver:
         return None if self._process is None else self._process.poll()
 
     def children(self, kind: str) -> list[psutil.Process]:
-        """The running processes of one kind of component, ordered by process id; suspended ones are left out."""
+        """The running processes of one kind, ordered by process id; suspended ones are left out."""
         found = []
         for process in _children(self._pid):
             try:
                 words = process.cmdline()
             except psutil.Error:
                 continue
-            if words and words[0].startswith(TITLES[kind]) and process.status() != psutil.STATUS_STOPPED:
+            if is_of_kind(words, kind) and process.status() != psutil.STATUS_STOPPED:
                 found.append(process)
         return sorted(found, key=lambda process: process.pid)
 
@@ -153,6 +155,11 @@ class Driver:
     def tail(self, lines: int) -> str:
         """The last lines of the output."""
         return "\n".join(self._log.read_text(errors="replace").splitlines()[-lines:])
+
+
+def is_of_kind(command_line: list[str], kind: str) -> bool:
+    """Whether a process with this command line is of the kind, a key of `TITLES`."""
+    return any(word.startswith(TITLES[kind]) for word in command_line)
 
 
 def fill_disk(process: psutil.Process) -> Callable[[], None]:

@@ -8,11 +8,12 @@ import psutil
 import pytest
 
 from deploy.chaos.config import write_config
-from deploy.chaos.faults import FULL, KINDS, MLFLOW, FaultKind, InjectedFault, fault_table, with_recovery
-from deploy.chaos.processes import fill_disk
+from deploy.chaos.faults import FULL, KINDS, MLFLOW, TRACKER, FaultKind, InjectedFault, fault_table, with_recovery
+from deploy.chaos.processes import TITLES, fill_disk, is_of_kind
 from deploy.cli import main, read_config_file
 from deploy.console.terminal import plain_console
 from learner.tracking.fault_log import DRIVER, FaultEntry
+from learner.tracking.tracker_process import MlflowProcess
 
 
 def entry(time_s, event, part):
@@ -70,8 +71,17 @@ def test_the_table_counts_faults_and_gives_median_and_maximum():
 
 def test_every_kind_of_process_is_a_victim():
     killed = {kind.victim for kind in KINDS if kind.action == "killed"}
-    assert killed == {"rollout worker", "replay shard", "evaluation", "learner", DRIVER, MLFLOW}
+    assert killed == {"rollout worker", "replay shard", "evaluation", "learner", DRIVER, MLFLOW, TRACKER}
     assert {kind.victim for kind in KINDS if kind.action == FULL} == {"rollout worker", "replay shard", "learner"}
+
+
+def test_the_process_that_writes_to_mlflow_is_found_by_its_command_line():
+    process = MlflowProcess()
+    try:
+        words = psutil.Process(process.pid).cmdline()
+    finally:
+        process.close()
+    assert [kind for kind in TITLES if is_of_kind(words, kind)] == [TRACKER]
 
 
 WRITER = """
