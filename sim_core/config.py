@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from sim_core.scenes.base import Scene
 
 MAX_HEADINGS = 64
+MAX_SPEED_LEVELS = 4
 MAX_HISTORY = 16
 MAX_DELAY_STEPS = 10
 MAX_TRACK_STEPS = 1_000
@@ -72,6 +73,8 @@ class WorldConfig:
     """`sensor`: angle 0 of sectors and headings is the world's +x axis (Eq. 3.3), or points to the own goal (ours)."""
     history: int = 1
     """Observations that the policy sees: the present one and those before the last decisions (ours; 1 in the text)."""
+    speed_levels: int = 1
+    """Speeds of every heading, equal parts of the learning robot's up to the whole (ours; 1 in the text)."""
     stop_action: bool = False
     """Adds an action that keeps the learning robot where it is (ours; the text has headings only)."""
     inner_radius_m: float = 0.5
@@ -285,8 +288,8 @@ class WorldConfig:
 
     @property
     def num_actions(self) -> int:
-        """Headings, plus one if there is a stop action."""
-        return self.sectors + int(self.stop_action)
+        """Headings, each with every speed, plus one if there is a stop action."""
+        return self.sectors * self.speed_levels + int(self.stop_action)
 
     @property
     def decision_s(self) -> float:
@@ -406,6 +409,10 @@ def _check_counts(config: WorldConfig) -> None:
     )
     require(config.groups >= 1, f"groups must be at least 1, not {config.groups}")
     require(2 <= config.sectors <= MAX_HEADINGS, f"sectors must be between 2 and {MAX_HEADINGS}, not {config.sectors}")
+    require(
+        1 <= config.speed_levels <= MAX_SPEED_LEVELS,
+        f"speed_levels must be between 1 and {MAX_SPEED_LEVELS}, not {config.speed_levels}",
+    )
     require(config.horizon_steps >= 1, f"horizon_steps must be at least 1, not {config.horizon_steps}")
     require(
         1 <= config.decision_interval_steps <= config.horizon_steps,

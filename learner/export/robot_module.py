@@ -117,8 +117,9 @@ class RobotModule(nn.Module):
         """What the module gives, in its order."""
         size = len(config.method_class.observation_names(config))
         speed = config.method_class.top_speed_m_s(config)
+        slower = f", then again for each lower one of {config.speed_levels} speeds" if config.speed_levels > 1 else ""
         stop = ", the last one stops" if config.stop_action else ""
-        heading = f"sector to head for, from angle -pi on{stop}{cls.undecided(config)}"
+        heading = f"sector to head for, from angle -pi on{slower}{stop}{cls.undecided(config)}"
         values = "discounted reward promised by each action"
         return [
             Port(

@@ -52,8 +52,8 @@ def unfit(path: Path) -> CheckpointError:
     """The error of a policy that is that of another network."""
     return CheckpointError(
         f"the policy {path} takes other observations or actions than this setup: name a run whose "
-        "hidden_sizes, network, sectors, stop_action and sensor_counts (for M_IN and M_OUT also method and groups) "
-        "are those of its config"
+        "hidden_sizes, network, sectors, speed_levels, stop_action and sensor_counts (for M_IN and M_OUT also method "
+        "and groups) are those of its config"
     )
 
 

@@ -214,7 +214,8 @@ class Method:
 
     def turn_actions(self, action: NDArray[Any], parts: NDArray[np.int64]) -> None:
         """Turns the headings among actions `[batch]` in place, as `turn` does; a stop stays."""
-        turn_headings(action, parts, self.config.sectors // self.turns(self.config), self.config.sectors)
+        sectors, levels = self.config.sectors, self.config.speed_levels
+        turn_headings(action, parts, sectors // self.turns(self.config), sectors, levels)
 
     def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
         """Writes the learning robots' velocities `[num_rows]` (m/s) for `action` `[num_rows]`: u_nn of Eq. 3.4.

@@ -1,4 +1,4 @@
-"""The action space that all methods share: q headings at constant speed (Eq. 3.3 and 3.4)."""
+"""The action space that all methods share: q headings at constant speed (Eq. 3.3 and 3.4), or at several speeds."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ def heading_velocities(config: WorldConfig, dtype: Any) -> NDArray[Any]:
     """Velocity of every action `[num_actions, 2]`, m/s (Eq. 3.3 and 3.4).
 
     Action a in 0..q-1 moves towards the centre of sector a. The text counts a from 1 to q+1, of which the
-    last repeats the first heading. A stop action, if there is one, comes last.
+    last repeats the first heading. With several speeds the q headings follow once more for each lower speed, the next
+    lower one first. A stop action, if there is one, comes last.
     """
-    q = config.sectors
+    q, levels = config.sectors, config.speed_levels
     alpha = math.pi / q + np.arange(q) * (2 * math.pi / q) - math.pi
-    velocity = config.learner_speed_m_s * np.stack([np.cos(alpha), np.sin(alpha)], axis=1)
+    heading = np.stack([np.cos(alpha), np.sin(alpha)], axis=1)
+    velocity = np.concatenate([config.learner_speed_m_s * level / levels * heading for level in range(levels, 0, -1)])
     if config.stop_action:
         velocity = np.concatenate([velocity, np.zeros((1, 2))])
     return velocity.astype(dtype)
@@ -36,11 +38,12 @@ def _write_headings(table, action, out_x, out_y):
 
 
 @kernel
-def turn_headings(action, parts, step, sectors):
-    """Turns headings `[batch]` in place: by `parts` `[batch]` times `step` sectors; other actions stay."""
+def turn_headings(action, parts, step, sectors, levels):
+    """Turns actions `[batch]` in place by `parts` `[batch]` times `step` of the `sectors`; a stop stays."""
     for i in range(action.shape[0]):
-        if action[i] < sectors:
-            action[i] = (action[i] + parts[i] * step) % sectors
+        if action[i] < sectors * levels:
+            heading = action[i] % sectors
+            action[i] += (heading + parts[i] * step) % sectors - heading
 
 
 def write_headings(table: NDArray[Any], action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:

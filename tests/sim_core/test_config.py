@@ -13,6 +13,7 @@ from sim_core.config import (
     LARGEST_REWARD,
     MAX_DELAY_STEPS,
     MAX_HEADINGS,
+    MAX_SPEED_LEVELS,
     MAX_TRACK_STEPS,
     NON_NEGATIVE,
     POSITIVE,
@@ -140,6 +141,7 @@ def test_a_speed_error_counts_for_the_distance_of_a_step():
         ("robots", 1, 2, None, None),
         ("groups", 0, 1, None, None),
         ("sectors", 1, 2, MAX_HEADINGS, MAX_HEADINGS + 1),
+        ("speed_levels", 0, 1, MAX_SPEED_LEVELS, MAX_SPEED_LEVELS + 1),
         ("horizon_steps", 0, 1, None, None),
         ("max_neighbours", 0, 1, 64, 65),
         ("outside_limit_steps", 0, 1, None, None),
@@ -235,8 +237,9 @@ def test_the_configuration_is_frozen_and_refuses_unknown_keys():
         WorldConfig(wheels=4)
 
 
-def test_stop_action_adds_one():
+def test_actions_are_headings_with_every_speed_and_a_stop():
     assert WorldConfig(sectors=6).num_actions == 6
+    assert WorldConfig(sectors=6, speed_levels=3, stop_action=True).num_actions == 19
     assert WorldConfig(sectors=6, stop_action=True).num_actions == 7
 
 

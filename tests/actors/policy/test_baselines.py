@@ -94,7 +94,9 @@ def test_greedy_nears_its_group_in_a_world(method):
     assert np.median(distance_m) < 1.0
 
 
-@pytest.mark.parametrize("settings", [{}, {"sectors": 16, "stop_action": True, "apf_rows": "all"}])
+@pytest.mark.parametrize(
+    "settings", [{}, {"sectors": 16, "stop_action": True, "apf_rows": "all"}, {"speed_levels": 2, "stop_action": True}]
+)
 def test_field_takes_the_action_nearest_to_attraction_and_repulsion(settings):
     config = WorldConfig(method="in", robots=6, groups=3, **settings)
     worlds = WorldBatch(config, 60)
@@ -104,6 +106,7 @@ def test_field_takes_the_action_nearest_to_attraction_and_repulsion(settings):
     chosen = MethodRule(config, Baseline.FIELD).act(observation)
     angle = math.pi / config.sectors + np.arange(config.sectors) * 2 * math.pi / config.sectors - math.pi
     actions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    actions = np.concatenate([actions * (1 - level / config.speed_levels) for level in range(config.speed_levels)])
     if config.stop_action:
         actions = np.concatenate([actions, [[0.0, 0.0]]])
     positions, repelled = worlds.positions().astype(np.float64), 0

@@ -59,7 +59,7 @@ def test_robots_may_differ_but_sectors_may_not(saved, small_run):
     more = RunConfig(world=WorldConfig(robots=9, groups=3, sectors=4), hidden_sizes=(8,))
     read_policy(checkpoint, more, env_shape(more.env))
     for world in (WorldConfig(sectors=5), WorldConfig(sectors=4, stop_action=True)):
-        with pytest.raises(CheckpointError, match="network, sectors, stop_action and sensor_counts"):
+        with pytest.raises(CheckpointError, match="network, sectors, speed_levels, stop_action and sensor_counts"):
             read_policy(checkpoint, small_run, env_shape(small_run.env._replace(world=world)))
 
 

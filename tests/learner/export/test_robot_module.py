@@ -21,6 +21,7 @@ WORLDS = {
     "sensor": WorldConfig(robots=6, groups=3),
     "sensor, counts apart": WorldConfig(robots=6, groups=3, sensor_counts="separate"),
     "sensor, odd sectors, stop": WorldConfig(robots=6, groups=1, sectors=5, stop_action=True),
+    "sensor, three speeds": WorldConfig(robots=6, groups=2, speed_levels=3, stop_action=True),
     "out": WorldConfig(method="out", robots=6, groups=3),
     "out, itself counted, faster": WorldConfig(
         method="out", robots=6, groups=2, ellipse_counts_learner=True, learner_speed_limit_m_s=1.5, apf_range_m=1.5

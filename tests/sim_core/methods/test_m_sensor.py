@@ -177,6 +177,15 @@ def test_headings_point_to_sector_centres_at_constant_speed(sectors, stop):
         assert velocities[sectors].tolist() == [0, 0]
 
 
+@pytest.mark.parametrize("levels", [2, 3])
+def test_headings_come_once_more_for_every_lower_speed(levels):
+    one = heading_velocities(WorldConfig(learner_speed_m_s=0.6), REAL)
+    several = heading_velocities(WorldConfig(learner_speed_m_s=0.6, speed_levels=levels, stop_action=True), REAL)
+    assert several.shape == (8 * levels + 1, 2) and several[-1].tolist() == [0, 0]
+    for level in range(levels):
+        np.testing.assert_allclose(several[8 * level : 8 * (level + 1)], one * (levels - level) / levels, rtol=1e-6)
+
+
 def test_velocity_looks_up_each_worlds_action():
     config = WorldConfig(sectors=4, stop_action=True)
     method, out_x, out_y = make_method(config), np.zeros(3, REAL), np.zeros(3, REAL)

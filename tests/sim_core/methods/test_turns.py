@@ -51,9 +51,10 @@ def test_a_turned_observation_is_that_of_the_turned_world(name):
             np.testing.assert_allclose(observation, wanted, atol=2e-5)
 
 
+@pytest.mark.parametrize("levels", [1, 3])
 @pytest.mark.parametrize("name", SETTINGS)
-def test_a_heading_turns_by_the_same_angle_and_a_stop_stays(name):
-    config = WorldConfig(robots=5, groups=4, **SETTINGS[name] | {"stop_action": True})
+def test_a_heading_turns_by_the_same_angle_and_keeps_its_speed_and_a_stop_stays(name, levels):
+    config = WorldConfig(robots=5, groups=4, **SETTINGS[name] | {"speed_levels": levels, "stop_action": True})
     method = WorldBatch(config, 1).method
     turns = method.turns(config)
     for part in range(turns):
@@ -62,7 +63,7 @@ def test_a_heading_turns_by_the_same_angle_and_a_stop_stays(name):
         angle = 2 * np.pi * part / turns
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         np.testing.assert_allclose(method.headings[action], method.headings @ turn.T, atol=1e-6)
-        assert action[-1] == config.sectors
+        assert action[-1] == config.num_actions - 1
 
 
 @pytest.mark.parametrize("name", SETTINGS)
