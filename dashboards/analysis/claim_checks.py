@@ -4,7 +4,7 @@ All tolerances of the claims are defined here:
 
 - `≈ x %` of a success rate, read from a bar chart: within 10 points of x. Of a failure rate: within 2 points.
 - "flat", "similar": differs by at most 2 points.
-- "none": at most 0.5 %, which is printed as 0 %.
+- "none", "the only": at most 0.5 %, which a bar chart cannot tell from none.
 - "decays fast": falls by more than with 10 and 15 robots do in the mean, whose decay the text calls smoother.
 - "outperforms" in every setup: the value is higher. Where both rates are at least 95 %, the text's bars cannot be told
   apart: there the other may be higher by 2 points. It fails only where the interval for all comparisons together
@@ -12,9 +12,9 @@ All tolerances of the claims are defined here:
 - "almost every": at least 80 %. "does not vanish": at least half. "close to zero": at most 10 %.
 
 A check holds if its whole 95 % interval lies in the range, fails if none of it does, and is undecided otherwise.
-`≈` and "around" are judged by the value alone: they hold if the value lies in the range, fail if the whole interval
-lies outside, and are undecided otherwise. The intervals are those of single checks. Of 50 checks whose truth lies on
-the limit, one or two are expected to fail by chance.
+`≈`, "around" and "none" are judged by the value alone: they hold if the value lies in the range, fail if the whole
+interval lies outside, and are undecided otherwise. The intervals are those of single checks. Of 50 checks whose truth
+lies on the limit, one or two are expected to fail by chance.
 """
 
 from __future__ import annotations
@@ -143,6 +143,11 @@ def at_least(name: str, measured: Measurement | None, limit: float) -> Check:
 def at_most(name: str, measured: Measurement | None, limit: float) -> Check:
     """The rate is `limit` or less."""
     return Check(name, f"≤ {_plain(limit)} %", measured, high=limit)
+
+
+def none(name: str, measured: Measurement | None) -> Check:
+    """The rate cannot be told from 0."""
+    return Check(name, f"none (≤ {_plain(NONE)} %), by value", measured, high=NONE, by_value=True)
 
 
 def rises(name: str, measured: Measurement | None) -> Check:

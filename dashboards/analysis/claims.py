@@ -39,7 +39,6 @@ from dashboards.analysis.aggregate import (
 )
 from dashboards.analysis.claim_checks import (
     ABOUT_FAILURE,
-    NONE,
     Check,
     Claim,
     about,
@@ -48,6 +47,7 @@ from dashboards.analysis.claim_checks import (
     at_least,
     at_most,
     no_worse,
+    none,
     outperforms,
     rises,
 )
@@ -196,7 +196,7 @@ def _out_fails_less(results: Results) -> list[Check]:
             rises(f"{n}r captured, M_sensor less M_OUT", difference(taken["sensor"][n], taken["out"][n]))
             for n in ROBOTS[1:]
         ),
-        *(at_most(f"5r captured, {name}", taken[method][5], NONE) for method, name in both),
+        *(none(f"5r captured, {name}", taken[method][5]) for method, name in both),
         *(at_most(f"{n}r captured, {name}", taken[method][n], 0.06) for method, name in both for n in ROBOTS[1:]),
         about("10r lost, M_sensor", gone["sensor"][10], 0.04, ABOUT_FAILURE),
         about("20r lost, M_sensor", gone["sensor"][20], 0.08, ABOUT_FAILURE),
