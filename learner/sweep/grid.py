@@ -257,13 +257,18 @@ def make_cells(sweep: SweepConfig) -> list[Cell]:
 
 
 def make_baseline_cell(sweep: SweepConfig, baseline: BaselineName, method: str, robots: int, groups: int) -> Cell:
-    """The cell of a baseline in the world of a method and setup.
+    """The cell of a baseline in the world of a method and setup; settings of trainings are no part of it.
 
     Raises:
       ConfigError: the setup is impossible.
     """
-    trained = make_cell(sweep, method, robots, groups, 0).config
-    config = dataclasses.replace(trained, final_eval_episodes=sweep.baseline_episodes)
+    config = RunConfig(
+        world=make_cell(sweep, method, robots, groups, 0).config.world,
+        engine="process",
+        device="cpu",
+        final_eval_episodes=sweep.baseline_episodes,
+        final_eval_first_seed=sweep.first_seed,
+    )
     name = config.world.method_name
     return Cell(f"{baseline}-{name}-{robots}r{groups}g-{cell_hash(config)}", config, baseline)
 

@@ -11,6 +11,7 @@ from learner.sweep.grid import (
     cell_hash,
     done_cells,
     extrapolation_worlds,
+    make_baseline_cell,
     make_cell,
     make_cells,
     wanted_episodes,
@@ -121,6 +122,20 @@ def test_schedules_are_stretched_to_the_length_of_the_training():
     assert make_cell(given, "out", 5, 1, 0).config.importance_exponent_env_steps == 7
     preset = make_cell(SMALL, "out", 5, 1, 0).config
     assert config.epsilon_decay_env_steps / 400_000 == preset.epsilon_decay_env_steps / preset.total_env_steps
+
+
+def test_a_rules_results_stay_valid_when_a_training_setting_changes():
+    plain, trained, world = (
+        dataclasses.replace(SMALL, set=changed)
+        for changed in ((), ("discount=0.5", "n_step=2"), ("robot_radius_m=0.05",))
+    )
+
+    def hashes(sweep):
+        rule, policy = make_baseline_cell(sweep, "greedy", "sensor", 5, 2), make_cell(sweep, "sensor", 5, 2, 0)
+        return cell_hash(rule.config), cell_hash(policy.config)
+
+    assert hashes(plain)[0] == hashes(trained)[0] != hashes(world)[0]
+    assert hashes(plain)[1] != hashes(trained)[1]
 
 
 def test_baselines_are_evaluated_in_the_world_of_every_cell():
