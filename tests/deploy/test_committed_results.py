@@ -80,6 +80,13 @@ def test_no_default_has_changed_since_the_results(folder):
         assert {name: now["world"][name] for name in values["world"]} == values["world"]
 
 
+def test_the_page_of_reasons_has_the_reports_verdicts_and_a_reason_for_each_that_fails():
+    verdicts = re.findall(r"^\| (\d+) \|[^|]*\| \*\*([^*]+)\*\* \|", (ROOT / "thesis" / "claims.md").read_text(), re.M)
+    rows = re.findall(r"^\| (\d+) \| ([a-z ]+) \|(.*)\|$", (ROOT.parent / "CLAIMS.md").read_text(), re.M)
+    assert len(rows) == 26 and [(number, verdict) for number, verdict, _ in rows] == verdicts
+    assert all((verdict == "holds") or len(reason) > 40 for _, verdict, reason in rows)
+
+
 def test_variants_have_the_settings_of_their_labels():
     (table,) = ROOT.glob(f"*/{VARIANTS}")
     told = [each.command for each in read_provenance(table)]
