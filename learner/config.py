@@ -442,17 +442,18 @@ def from_dict(values: dict[str, Any]) -> RunConfig:
     return RunConfig(**plain)
 
 
-UNCOUNTED = (
-    "discount_time_s",
-    "speed_levels",
-    "learners",
-    "ended_learners",
-    "kinematics",
-    "turn_rate_limit_deg_s",
-    "acceleration_limit_m_s2",
-    "track_steps",
-)
-"""Settings that hashes leave out at their defaults: runs from before there were such settings keep their hashes."""
+UNCOUNTED = {
+    "discount_time_s": 0.0,
+    "speed_levels": 1,
+    "learners": ONE_LEARNER,
+    "ended_learners": "fl-orca",
+    "kinematics": "holonomic",
+    "turn_rate_limit_deg_s": 180.0,
+    "acceleration_limit_m_s2": 2.0,
+    "track_steps": 0,
+}
+"""Settings that hashes leave out at these values, whatever the defaults are later: runs from before there were such
+settings keep their hashes."""
 
 
 def identity_dict(config: RunConfig) -> dict[str, Any]:
@@ -460,10 +461,9 @@ def identity_dict(config: RunConfig) -> dict[str, Any]:
     values = to_dict(config)
     for kind in (METHODS, SCENES):
         values["world"][kind.setting] = identity(kind, values["world"][kind.setting])
-    for section, of in ((values, RunConfig), (values["world"], WorldConfig)):
-        for name in UNCOUNTED:
-            if name in section and section[name] == of.__dataclass_fields__[name].default:
-                del section[name]
+    for section in (values, values["world"]):
+        for name in [name for name, value in UNCOUNTED.items() if section.get(name) == value]:
+            del section[name]
     values["world"]["sources"] = tuple((os.path.basename(path), text) for path, text in config.world.sources)
     return values
 

@@ -74,7 +74,7 @@ class WorldConfig:
     history: int = 1
     """Observations that the policy sees: the present one and those before the last decisions (ours; 1 in the text)."""
     speed_levels: int = 1
-    """Speeds of every heading, equal parts of the learning robot's up to the whole (ours; 1 in the text)."""
+    """n, the number of speeds of every heading: 1/n, 2/n ... n/n of `learner_speed_m_s` (ours; 1 in the text)."""
     stop_action: bool = False
     """Adds an action that keeps the learning robot where it is (ours; the text has headings only)."""
     inner_radius_m: float = 0.5
@@ -82,7 +82,7 @@ class WorldConfig:
     outer_radius_m: float = 1.5
     """R2, radius of the outer sensing ring; also the goal distance that means success (Table 3.2)."""
     learner_speed_m_s: float = 1.0
-    """v, the constant speed of the learning robot (Table 3.2)."""
+    """v, the speed of the learning robot's headings (Table 3.2); the largest, where there are several."""
     horizon_steps: int = 500
     """eta, simulator steps after which an episode is cut (Table 3.2)."""
     decision_interval_steps: int = 1

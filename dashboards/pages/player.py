@@ -84,7 +84,7 @@ def player_data(episode: Episode, config: WorldConfig) -> dict[str, Any]:
     - `positions` `[T + 1, num_robots, 2]` int16: differences from state to state, the first from 0, modulo 2^16, in
       units of `metres_per_unit`; all low bytes come before all high bytes.
     - `machine` `[T + 1, num_robots]` uint8: states of the FL-ORCA machine (`sim_core.swarm.flock_rules.STATE_NAMES`).
-    - `actions` `[T + 1]` int8: the learning robot's actions.
+    - `actions` `[T + 1]` int16: the learning robot's actions.
     - `sensed`, as `positions`: where the learning robot senses the robots, -2^15 for nowhere; null if it senses well.
     - `asked` `[T + 1, 2]` int16: the velocity asked for before shield or unicycle, mm/s; null without.
 
@@ -112,7 +112,7 @@ def player_data(episode: Episode, config: WorldConfig) -> dict[str, Any]:
         "asked": packed(np.rint(1000 * episode.asked).astype("<i2").tobytes()) if len(episode.asked) else None,
         "metres_per_unit": metres_per_unit,
         "machine": packed(episode.machine.astype(np.uint8).tobytes()),
-        "actions": packed(episode.action.astype(np.int8).tobytes()),
+        "actions": packed(episode.action.astype("<i2").tobytes()),
         "piloted": episode.is_piloted,
         "goals": [[round(float(x), 4), round(float(y), 4)] for x, y in episode.goal],
         "learner": episode.learner,
@@ -136,6 +136,7 @@ def _scene(config: WorldConfig) -> dict[str, Any]:
         "group_sizes": list(config.group_sizes),
         "groups": config.groups,
         "sectors": config.sectors,
+        "speed_levels": config.speed_levels,
         "sectors_face_goal": config.sector_frame == "goal",
         "time_step_s": config.time_step_s,
         "view_half_m": view_half_m(config),

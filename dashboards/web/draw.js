@@ -98,7 +98,8 @@ function drawSensing() {
   }
   if (data.draws_sectors) drawSectors(x, y, outer);
   const action = actions[Math.floor(step)];
-  if (action >= 0 && action < data.sectors) drawHeading(x, y, inner, headingOf(action));
+  const level = Math.floor(action / data.sectors), share = 1 - level / data.speed_levels;
+  if (action >= 0 && share > 0) drawHeading(x, y, inner * share, headingOf(action % data.sectors));
 }
 
 // The angle from which sectors are counted: 0, or the direction of the learning robot's goal.

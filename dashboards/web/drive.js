@@ -55,7 +55,7 @@ function makeRoom(steps) {
   };
   positions = grown(positions, Float32Array);
   machine = grown(machine, Uint8Array);
-  actions = grown(actions, Int8Array, -1);
+  actions = grown(actions, Int16Array, -1);
   sensed = sensed && grown(sensed, Float32Array);
   asked = null;
   data.steps = steps;

@@ -30,7 +30,7 @@ function decodePositions(bytes) {
 
 async function load(next) {
   const planes = await inflate(next.positions), states = await inflate(next.machine);
-  const taken = new Int8Array((await inflate(next.actions)).buffer);
+  const taken = new Int16Array((await inflate(next.actions)).buffer);
   const senses = next.sensed && await inflate(next.sensed), wishes = next.asked && await inflate(next.asked);
   setPlaying(false);
   data = next;

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import psutil
 from rich.console import Console
@@ -27,6 +28,14 @@ DELAY_S = 2.0
 """Duration of a delay; shorter than the deadline, so that the component is not replaced."""
 OUTAGE_S = 6.0
 """Time after which a killed MLflow server is started again."""
+
+
+class _Outage(NamedTuple):
+    """An outage of MLflow: the fault, how much of the journal MLflow had, and the processes that wrote to it."""
+
+    fault: InjectedFault
+    mark: int
+    writers: list[psutil.Process]
 
 
 class ChaosRun:
@@ -54,7 +63,7 @@ class ChaosRun:
         self.injected: list[InjectedFault] = []
         self.outages: list[InjectedFault] = []
         self._server_back_s = 0.0
-        self._outage: tuple[InjectedFault, int] | None = None
+        self._outage: _Outage | None = None
         self._pending_ends: list[tuple[float, Callable[[], None]]] = []
         self._checkpoints_at_setback: set[str] | None = set()
         self._drawn: tuple[FaultKind, float] | None = None
@@ -79,14 +88,18 @@ class ChaosRun:
         """
         end_s = time.monotonic() + self._command.limit_s
         next_s = time.monotonic()
-        while (code := self.driver.exit_code()) is None or self._outage is not None:
+        while (code := self.driver.exit_code()) is None:
             if time.monotonic() > end_s:
                 raise TimeoutError(f"no end after {self._command.limit_s:.0f} s:\n{self.driver.tail(30)}")
             self._end_transient_faults()
             self._follow_outage()
-            if code is None and time.monotonic() >= next_s and self._may_inject() and self._inject():
+            if time.monotonic() >= next_s and self._may_inject() and self._inject():
                 next_s = time.monotonic() + self._rng.uniform(0.5, 1.5) * self._command.every_s
             time.sleep(POLL_S)
+        if self._outage is not None:  # the run ended first
+            self.outages.append(self._outage.fault)
+        self.server.start_again()  # what it has is checked next
+        self.server.wait()
         return code
 
     def _checkpoints(self) -> set[str]:
@@ -94,7 +107,7 @@ class ChaosRun:
 
     def _may_inject(self) -> bool:
         """False before the first checkpoint, and after a setback before the next one, so that the run advances."""
-        if len(self.injected) + len(self.outages) >= self._command.faults:
+        if len(self.injected) + len(self.outages) + (self._outage is not None) >= self._command.faults:
             return False
         if self._checkpoints_at_setback is None:
             return True
@@ -106,7 +119,8 @@ class ChaosRun:
     def _draw(self) -> FaultKind:
         """The last drawn kind while a victim is searched for, else a new one."""
         if self._drawn is None or time.monotonic() > self._drawn[1]:
-            kind = self._rng.choices(KINDS, [kind.weight for kind in KINDS])[0]
+            kinds = [kind for kind in KINDS if self._outage is None or kind.victim not in (MLFLOW, TRACKER)]
+            kind = self._rng.choices(kinds, [kind.weight for kind in kinds])[0]
             self._drawn = (kind, time.monotonic() + SEARCH_S)
         return self._drawn[0]
 
@@ -122,23 +136,21 @@ class ChaosRun:
             victims = self.driver.children(kind.victim)
             if not victims:
                 return False
-            self._apply(kind, self._rng.choice(victims))
+            if not self._apply(kind, self._rng.choice(victims)):
+                return False
             self._record(kind, now_s)
         self._drawn = None
         return True
 
     def _cut_off_mlflow(self, kind: FaultKind, now_s: float) -> bool:
         """Kills the MLflow server, or the process that writes to it; returns whether there was one to kill."""
-        if self._outage is not None:
-            return False
+        mark, writers = PushedMark.value(self.folder.pushed), self.driver.children(TRACKER)
         if kind.victim == MLFLOW:
             self.server.kill()
             self._server_back_s = now_s + OUTAGE_S
-        elif writers := self.driver.children(TRACKER):
-            self._apply(kind, writers[0])
-        else:
+        elif not writers or not self._apply(kind, writers[0]):
             return False
-        self._outage = (InjectedFault(kind, now_s), PushedMark.value(self.folder.pushed))
+        self._outage = _Outage(InjectedFault(kind, now_s), mark, writers)
         self._print(kind)
         return True
 
@@ -150,7 +162,8 @@ class ChaosRun:
         self.server.wait()
         self.driver.start("resume", NAME, *self._flags(False))
 
-    def _apply(self, kind: FaultKind, victim: psutil.Process) -> None:
+    def _apply(self, kind: FaultKind, victim: psutil.Process) -> bool:
+        """Does to a process what the kind says; returns whether it was still there."""
         if kind.victim == "learner" and kind.action not in TRANSIENT:
             self._checkpoints_at_setback = self._checkpoints()
         try:
@@ -161,9 +174,10 @@ class ChaosRun:
             else:
                 victim.suspend()
         except psutil.NoSuchProcess:
-            return
+            return False
         if kind.action == DELAYED:
             self._schedule(DELAY_S, victim.resume)
+        return True
 
     def _schedule(self, seconds: float, call: Callable[[], None]) -> None:
         self._pending_ends.append((time.monotonic() + seconds, call))
@@ -185,14 +199,15 @@ class ChaosRun:
                 continue
 
     def _follow_outage(self) -> None:
-        """Restarts a killed MLflow server in time; an outage ends once new rows have been delivered."""
+        """Restarts a killed MLflow server in time; an outage ends once a checkpoint's rows are delivered."""
         if self._outage is None:
             return
         if self._server_back_s and time.time() >= self._server_back_s:
             self._server_back_s = 0.0
             self.server.start_again()
-        fault, mark = self._outage
-        if PushedMark.value(self.folder.pushed) > mark or self.driver.exit_code() == 0:
+        fault, mark, writers = self._outage
+        replaced = fault.kind.victim == MLFLOW or self.driver.children(TRACKER) not in ([], writers)
+        if replaced and PushedMark.value(self.folder.pushed) > mark:
             self.outages.append(fault._replace(recovery_s=time.time() - fault.time_s))
             self._outage = None
 

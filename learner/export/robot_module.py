@@ -117,7 +117,8 @@ class RobotModule(nn.Module):
         """What the module gives, in its order."""
         size = len(config.method_class.observation_names(config))
         speed = config.method_class.top_speed_m_s(config)
-        slower = f", then again for each lower one of {config.speed_levels} speeds" if config.speed_levels > 1 else ""
+        q, levels = config.sectors, config.speed_levels
+        slower = f"; action a: sector a mod {q} at ({levels} - a div {q}) / {levels} of the speed" if levels > 1 else ""
         stop = ", the last one stops" if config.stop_action else ""
         heading = f"sector to head for, from angle -pi on{slower}{stop}{cls.undecided(config)}"
         values = "discounted reward promised by each action"

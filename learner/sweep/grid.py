@@ -155,7 +155,7 @@ class Cell(NamedTuple):
         return evaluation + (training if self.policy == LEARNED else 0.0)
 
 
-ORIGINAL_DEFAULTS = {"steps_per_block": 32, "updates_per_call": 32}
+ORIGINAL_DEFAULTS: dict[str, Any] = {"steps_per_block": 32, "updates_per_call": 32}
 """Original values of the defaults that have changed since the first results were committed."""
 
 
@@ -257,7 +257,7 @@ def make_cells(sweep: SweepConfig) -> list[Cell]:
 
 
 def make_baseline_cell(sweep: SweepConfig, baseline: BaselineName, method: str, robots: int, groups: int) -> Cell:
-    """The cell of a baseline in the world of a method and setup; settings of trainings are no part of it.
+    """The cell of a baseline in the world of a method and setup; no setting of trainings is in its hash.
 
     Raises:
       ConfigError: the setup is impossible.
@@ -269,6 +269,7 @@ def make_baseline_cell(sweep: SweepConfig, baseline: BaselineName, method: str, 
         final_eval_episodes=sweep.baseline_episodes,
         final_eval_first_seed=sweep.first_seed,
     )
+    config = dataclasses.replace(config, **ORIGINAL_DEFAULTS)
     name = config.world.method_name
     return Cell(f"{baseline}-{name}-{robots}r{groups}g-{cell_hash(config)}", config, baseline)
 

@@ -231,7 +231,7 @@ class SensorMethod(Method):
         _turn(observation, parts, self.config.sectors, np.zeros(self.config.sectors, observation.dtype))
 
     def velocity(self, state: WorldState, action: NDArray[np.int64], out_x: Any, out_y: Any) -> None:
-        """Eq. 3.4: constant speed towards the chosen sector's centre, in the frame of the sectors.
+        """Eq. 3.4: the speed of the action, towards the chosen sector's centre, in the frame of the sectors.
 
         Raises:
           ValueError: there is not one action a row, or one is none of the actions.

@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from deploy.chaos.processes import TITLES
-from learner.tracking import tracker_process
+from deploy.chaos.processes import TITLES, is_of_kind
 
-SPY, IDLE, MLFLOW = "profiler", "idle worker of Ray", "MLflow"
+SPY, IDLE = "profiler", "idle worker of Ray"
 
 
 def kind_of(process: psutil.Process) -> str:
@@ -17,10 +16,8 @@ def kind_of(process: psutil.Process) -> str:
     words = process.cmdline() or [process.name()]
     if Path(words[0]).name == "py-spy":
         return SPY
-    if tracker_process.__name__ in words:
-        return MLFLOW
-    for kind, title in TITLES.items():
-        if words[0].startswith(title):
+    for kind in TITLES:
+        if is_of_kind(words, kind):
             return kind
     if words[0].startswith("ray::IDLE"):
         return IDLE

@@ -51,7 +51,7 @@ def test_positions_are_decoded_within_the_quantisation(episode: Episode, config:
     assert data["metres_per_unit"] <= 0.0005
     machine = decoded(data, "machine", "u1").reshape(episode.machine.shape)
     np.testing.assert_array_equal(machine, episode.machine)
-    np.testing.assert_array_equal(decoded(data, "actions", "i1"), episode.action)
+    np.testing.assert_array_equal(decoded(data, "actions", "<i2"), episode.action)
     assert data["steps"] == len(episode.action) - 1
     assert data["learner"] == episode.learner
     np.testing.assert_allclose(data["goals"], episode.goal, atol=1e-4)

@@ -1,6 +1,7 @@
 """Faults of a chaos run, and their recovery times."""
 
 import io
+import signal
 import subprocess
 import sys
 
@@ -9,10 +10,13 @@ import pytest
 
 from deploy.chaos.config import write_config
 from deploy.chaos.faults import FULL, KINDS, MLFLOW, TRACKER, FaultKind, InjectedFault, fault_table, with_recovery
+from deploy.chaos.injection import ChaosRun
 from deploy.chaos.processes import TITLES, fill_disk, is_of_kind
 from deploy.cli import main, read_config_file
 from deploy.console.terminal import plain_console
+from deploy.options.training import Chaos
 from learner.tracking.fault_log import DRIVER, FaultEntry
+from learner.tracking.journal import PushedMark
 from learner.tracking.tracker_process import MlflowProcess
 
 
@@ -82,6 +86,56 @@ def test_the_process_that_writes_to_mlflow_is_found_by_its_command_line():
     finally:
         process.close()
     assert [kind for kind in TITLES if is_of_kind(words, kind)] == [TRACKER]
+
+
+class FakeServer:
+    def kill(self):
+        pass
+
+    def start_again(self):
+        pass
+
+
+class FakeDriver:
+    """A driver whose child writes to MLflow, and is replaced when the test says so."""
+
+    def __init__(self):
+        self.child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)", TITLES[TRACKER][0]])
+        self.writers = [psutil.Process(self.child.pid)]
+
+    def children(self, kind):
+        assert kind == TRACKER
+        return self.writers
+
+
+def test_an_outage_of_mlflow_ends_when_another_process_has_delivered_rows(tmp_path):
+    chaos = ChaosRun(Chaos(out=tmp_path), plain_console(file=io.StringIO()))
+    chaos.driver, chaos.server = driver, server = FakeDriver(), FakeServer()
+    chaos.folder.path.mkdir()
+    mark = PushedMark(chaos.folder.pushed, 1_000)
+    mark.write(10)
+    kind = next(kind for kind in KINDS if kind.victim == TRACKER)
+    assert chaos._cut_off_mlflow(kind, 5.0) and driver.child.wait() == -signal.SIGKILL and chaos.server is server
+    mark.write(20)  # by the process that was killed: its reply was on the way
+    chaos._follow_outage()
+    assert chaos.outages == []
+    driver.writers = []
+    chaos._follow_outage()
+    assert chaos.outages == []
+    driver.writers = [psutil.Process()]
+    chaos._follow_outage()
+    assert [fault.kind for fault in chaos.outages] == [kind] and chaos.outages[0].recovery_s > 0
+
+
+def test_a_process_that_has_gone_by_itself_is_no_fault(tmp_path):
+    chaos = ChaosRun(Chaos(out=tmp_path), plain_console(file=io.StringIO()))
+    chaos.driver, chaos.server = driver, _ = FakeDriver(), FakeServer()
+    driver.child.kill()
+    driver.child.wait()
+    kind = next(kind for kind in KINDS if kind.victim == TRACKER)
+    assert not chaos._cut_off_mlflow(kind, 5.0)
+    driver.writers = []
+    assert not chaos._cut_off_mlflow(kind, 5.0)
 
 
 WRITER = """

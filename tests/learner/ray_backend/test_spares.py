@@ -15,7 +15,7 @@ from actors.rollout.env_spec import EnvSpec
 from actors.rollout.node import RolloutNode
 from actors.rollout.vector_env import env_shape
 from actors.service.rpc import LocalCalls, local_handle
-from deploy.chaos.processes import TITLES
+from deploy.chaos.processes import TITLES, is_of_kind
 from learner.cluster_options import ClusterOptions
 from learner.ray_backend.spares import SpareShard, SpareWorker
 from learner.training.cluster import rollout_settings, shard_settings
@@ -94,7 +94,7 @@ def test_a_spare_shard_that_has_begun_is_empty_and_stores():
 
 def is_seen_as(pid, *kinds):
     """Whether the title of a process is that of a component of one of the kinds."""
-    return psutil.Process(pid).cmdline()[0].startswith(tuple(title for kind in kinds for title in TITLES[kind]))
+    return any(is_of_kind(psutil.Process(pid).cmdline(), kind) for kind in kinds)
 
 
 def wait_until(condition):

@@ -7,6 +7,7 @@ import pytest
 from actors.evaluation.result_table import ResultRow
 from learner.config import RunConfig, to_dict
 from learner.sweep.grid import (
+    ORIGINAL_DEFAULTS,
     SweepConfig,
     cell_hash,
     done_cells,
@@ -136,6 +137,8 @@ def test_a_rules_results_stay_valid_when_a_training_setting_changes():
 
     assert hashes(plain)[0] == hashes(trained)[0] != hashes(world)[0]
     assert hashes(plain)[1] != hashes(trained)[1]
+    rule = make_baseline_cell(plain, "greedy", "sensor", 5, 2).config  # and when a default changes: it is not hashed
+    assert all(getattr(rule, name) == value for name, value in ORIGINAL_DEFAULTS.items())
 
 
 def test_baselines_are_evaluated_in_the_world_of_every_cell():
