@@ -19,8 +19,8 @@ differences and means. Counts of different seeds vary more than those of one pol
 how much more, estimated over the cells of one method and as many robots (Pearson's dispersion, whose variances are
 proportional to p(1 − p)). With one seed they speak of that policy alone. All play the same start scenes. A check
 **holds** where its whole interval is in the wanted range, **does not hold** where none of it is, and is
-**undecided** between; `≈`, "around" and "none" are met by the value alone (within 10 points, for failure rates
-within 2). "None" is up to 0.5 %, "flat" and "similar" allow 2 points. In claim 11 the value alone decides, both
+**undecided** between. Met by the value alone are `≈` and "around" (within 10 points, for failure rates within 2),
+"none" and "the only" (up to 0.5 %). "Flat" and "similar" allow 2 points. In claim 11 the value alone decides, both
 methods above 95 % tie, and the intervals are those of fifty comparisons together (Bonferroni). A claim holds if all
 its checks hold, and does not if any does not. From 16 on these are further statements of the text."""
 

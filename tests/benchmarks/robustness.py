@@ -1,11 +1,11 @@
 """`make robustness`: policies trained for bad senses beside policies trained without, and beside the rules.
 
 For every method, trainings of the preset `generalist` in three setups with several seeds: `clean`; `drawn`, with
-conditions drawn for every episode (domain randomisation); `drawn, history`, which also sees what it sensed before; and
-`drawn, tracked`, which takes robots that it does not sense any more to go on with their last velocity; `drawn, tracked,
-shield`, which keeps ORCA's half-planes against the robots that it takes to be there too. All policies and rules meet
-the same start scenes under each condition by itself. Differences are paired: an episode's mean over the trainings, less
-that of `clean` without any condition. A player breaks where its success falls to 50 %.
+conditions drawn for every episode (domain randomisation); `drawn, history`, which also sees what it sensed before;
+`drawn, tracked`, which takes robots that it does not sense any more to go on with their last velocity; and `drawn,
+tracked, shield`, which also keeps ORCA's half-planes against the robots it takes to be there. All policies and rules
+meet the same start scenes under each condition by itself. Differences are paired: an episode's mean over the trainings,
+less that of `clean` without any condition. A player breaks where its success falls to 50 %.
 """
 
 import argparse
@@ -40,7 +40,7 @@ DRAWN = (
     *("--position-delay-steps", "3", "--dropped-mates", "1"),
 )
 FADES = ("--teacher-weight-end", "0", "--teacher-decay-env-steps", str(ENV_STEPS // 3))
-"""The teacher of M_IN and M_OUT is a rule for good senses: it has no say in the end."""
+"""The teacher of M_IN and M_OUT is a rule for good senses: unless robots are tracked, it has no say in the end."""
 KINDS = {
     CLEAN: (),
     "drawn": (*DRAWN, *FADES),

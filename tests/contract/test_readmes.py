@@ -48,6 +48,7 @@ def test_there_is_a_readme_wherever_the_first_one_leads():
 @pytest.mark.parametrize("page", LONGEST_LINES, ids=lambda path: path.name)
 def test_pages_that_are_read_as_a_whole_are_short(page):
     assert len(page.read_text().splitlines()) <= LONGEST_LINES[page]
+    assert len(page.read_text()) <= 100 * LONGEST_LINES[page]
 
 
 @each_readme

@@ -13,13 +13,18 @@ from PIL import Image
 import dashboards
 from actors.evaluation.result_table import LEARNED, read_table
 from actors.evaluation.value_table import read_values
+from dashboards.analysis.claim_checks import Verdict
+from dashboards.analysis.claims import judge
+from dashboards.analysis.comparison import results_of
 from deploy.cli import main
+from deploy.report_data.beside import values_beside, variants_beside
 from deploy.runs.sweep_provenance import grid_of, read_provenance
 from learner.config import RunConfig, to_dict
 from learner.file_names import RESULTS, SETTINGS, VALUES, VARIANTS
 from learner.sweep.grid import expected_hash, make_cell, sweep_of_label
 
 ROOT = Path(dashboards.__file__).parent / "results"
+CLAIMS = ROOT.parent / "CLAIMS.md"
 FOLDERS = sorted(path.parent for path in ROOT.glob("*/results.csv"))
 
 
@@ -82,9 +87,22 @@ def test_no_default_has_changed_since_the_results(folder):
 
 def test_the_page_of_reasons_has_the_reports_verdicts_and_a_reason_for_each_that_fails():
     verdicts = re.findall(r"^\| (\d+) \|[^|]*\| \*\*([^*]+)\*\* \|", (ROOT / "thesis" / "claims.md").read_text(), re.M)
-    rows = re.findall(r"^\| (\d+) \| ([a-z ]+) \|(.*)\|$", (ROOT.parent / "CLAIMS.md").read_text(), re.M)
+    rows = re.findall(r"^\| (\d+) \| ([a-z ]+) \|(.*)\|$", CLAIMS.read_text(), re.M)
     assert len(rows) == 26 and [(number, verdict) for number, verdict, _ in rows] == verdicts
     assert all((verdict == "holds") or len(reason) > 40 for _, verdict, reason in rows)
+
+
+def test_the_page_of_reasons_says_which_claims_hold_in_which_world():
+    rows = re.findall(
+        r"^\|[^|]+\| \[[\w-]+\]\((results/[\w/-]+\.csv)\) \|([^|]*)\|([^|]*)\|$", CLAIMS.read_text(), re.M
+    )
+    assert len(rows) == 5
+    for path, *told in rows:
+        table = ROOT.parent / path
+        (found,) = map(judge, results_of(read_table(table), variants_beside([table]), values_beside([table])).values())
+        for verdict, text in zip((Verdict.HOLDS, Verdict.UNDECIDED), told, strict=True):
+            numbers = [int(number) for number in re.findall(r"\d+", re.sub(r"\(.*\)", "", text))]
+            assert numbers == [claim.number for claim in found if claim.verdict is verdict], (path, verdict)
 
 
 def test_variants_have_the_settings_of_their_labels():

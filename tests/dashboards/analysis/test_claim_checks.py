@@ -16,6 +16,7 @@ from dashboards.analysis.claim_checks import (
     at_least,
     at_most,
     no_worse,
+    none,
     number_text,
     rises,
 )
@@ -62,6 +63,19 @@ def test_about_is_met_by_the_value_within_ten_points(interval: tuple[float, floa
 def test_about_a_failure_rate_is_within_two_points():
     assert about("x", measured(0.06, 0.055, 0.065), 0.04, 0.02).verdict is HOLDS
     assert about("x", measured(0.08, 0.075, 0.085), 0.04, 0.02).verdict is FAILS
+
+
+@pytest.mark.parametrize(
+    ("interval", "verdict"),
+    [
+        ((0.0, 0.0, 0.02), HOLDS),
+        ((0.005, 0.0, 0.02), HOLDS),
+        ((0.006, 0.0, 0.02), UNDECIDED),
+        ((0.02, 0.01, 0.03), FAILS),
+    ],
+)
+def test_none_is_met_by_the_value_up_to_half_a_percent(interval: tuple[float, float, float], verdict: Verdict):
+    assert none("x", measured(*interval)).verdict is verdict
 
 
 def test_about_all_and_around_or_more_have_no_upper_limit():
