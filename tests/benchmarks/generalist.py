@@ -31,8 +31,7 @@ from learner.tracking.journal import read_rows
 from sim_core import ENV_ID
 from sim_core.config import WorldConfig
 from sim_core.outcomes import ENDED, OUTCOME_NAMES, Outcome
-from sim_core.plugins import DISSERTATION_METHODS
-from tests.benchmarks.trainings import trained
+from tests.benchmarks.trainings import study_parser, trained
 
 UNSEEN = ((7, 3), (12, 5), (30, 2), (3, 6))
 """Robots per group and groups that no training plays."""
@@ -40,16 +39,8 @@ RULES = (Baseline.FL_ORCA, Baseline.GREEDY, Baseline.FIELD)
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.generalist", description=__doc__)
-    parser.add_argument("--methods", nargs="+", choices=DISSERTATION_METHODS, default=list(DISSERTATION_METHODS))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of the trainings")
-    parser.add_argument("--episodes", type=int, default=1_000, help="per player and setup")
-    parser.add_argument(
-        "--first-seed", type=int, default=2_000_000_000, help="of the episodes; calibration: 3000000000"
-    )
-    parser.add_argument("--runs-dir", type=Path, default=Path("runs/generalist"), help="finished trainings are kept")
+    parser = study_parser("tests.benchmarks.generalist", __doc__, 1_000, Path("runs/generalist"))
     parser.add_argument("--out", type=Path, help="a CSV file for all counts")
-    parser.add_argument("train", nargs="*", help="after --: settings of the trainings, as of `shoal train`")
     return parser.parse_args(arguments)
 
 

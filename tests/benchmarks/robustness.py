@@ -29,8 +29,8 @@ from deploy.options.results import Stress
 from deploy.playing.players import find_players
 from deploy.playing.stress_results import StressResults
 from learner.run_folder import RunFolder
-from sim_core.plugins import DISSERTATION_METHODS, METHODS, find
-from tests.benchmarks.trainings import trained
+from sim_core.plugins import METHODS, find
+from tests.benchmarks.trainings import study_parser, trained
 
 SETUPS = ("5x2", "10x4", "25x4")
 ENV_STEPS = 600_000
@@ -65,16 +65,7 @@ SHOWN = (("position_loss", 0.0), ("position_loss", 0.5), ("position_noise_m", 0.
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.robustness", description=__doc__)
-    parser.add_argument("--methods", nargs="+", choices=DISSERTATION_METHODS, default=list(DISSERTATION_METHODS))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of the trainings")
-    parser.add_argument("--episodes", type=int, default=300, help="per player, setup and condition")
-    parser.add_argument("--first-seed", type=int, default=2_000_000_000, help="of the episodes")
-    parser.add_argument(
-        "--runs-dir", type=Path, default=Path("runs/robustness"), help="what is trained, played and found"
-    )
-    parser.add_argument("train", nargs="*", help="after --: settings of the trainings, as of `shoal train`")
-    return parser.parse_args(arguments)
+    return study_parser("tests.benchmarks.robustness", __doc__, 300, Path("runs/robustness")).parse_args(arguments)
 
 
 def run_name(method: str, kind: str, seed: int) -> str:

@@ -1,7 +1,8 @@
 """What learning as a unicycle gains: policies trained so, beside policies trained as a holonomic robot, and the rules.
 
 For every method, trainings of the preset `generalist` in three setups with several seeds, with either robot; then all
-drive a unicycle in the same start scenes.
+drive a unicycle in the same start scenes. The teacher of M_IN and M_OUT is a rule for a holonomic robot, so in trainings as
+a unicycle it fades.
 
 python -m tests.benchmarks.unicycle_learned
 """
@@ -22,10 +23,12 @@ from deploy.console.summary_tables import signed_percent
 from deploy.runs.policy_lookup import find_policy
 from sim_core import ENV_ID
 from sim_core.outcomes import Outcome
-from sim_core.plugins import DISSERTATION_METHODS, METHODS, find
+from sim_core.plugins import METHODS, find
 from tests.benchmarks.robustness import CLEAN, FADES, training
+from tests.benchmarks.trainings import study_parser
+from tests.benchmarks.unicycle import LIMITS
 
-TURN_DEG_S, ACCELERATION_M_S2 = 180.0, 2.0
+TURN_DEG_S, ACCELERATION_M_S2 = LIMITS[1]
 HOLONOMIC, TRAINED = "trained as a holonomic robot", "trained as a unicycle"
 DRIVING = (
     *("--kinematics", "unicycle", "--turn-rate-limit-deg-s", str(TURN_DEG_S)),
@@ -35,16 +38,9 @@ RULES = (Baseline.GREEDY, Baseline.FIELD, Baseline.FL_ORCA)
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.unicycle_learned", description=__doc__)
-    parser.add_argument("--methods", nargs="+", choices=DISSERTATION_METHODS, default=list(DISSERTATION_METHODS))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of the trainings")
-    parser.add_argument("--episodes", type=int, default=1_000, help="per player and setup")
-    parser.add_argument("--first-seed", type=int, default=2_000_000_000, help="of the episodes")
-    parser.add_argument(
-        "--runs-dir", type=Path, default=Path("runs/robustness"), help="finished trainings are kept, here and there"
+    return study_parser("tests.benchmarks.unicycle_learned", __doc__, 1_000, Path("runs/robustness")).parse_args(
+        arguments
     )
-    parser.add_argument("train", nargs="*", help="after --: settings of the trainings, as of `shoal train`")
-    return parser.parse_args(arguments)
 
 
 def outcomes(method: str, options: argparse.Namespace) -> dict[str, dict[str, np.ndarray]]:
