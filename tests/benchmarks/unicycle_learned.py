@@ -1,8 +1,8 @@
 """What learning as a unicycle gains: policies trained so, beside policies trained as a holonomic robot, and the rules.
 
 For every method, trainings of the preset `generalist` in three setups with several seeds, with either robot; then all
-drive a unicycle in the same start scenes. M_IN and M_OUT have a teacher that is a rule for a holonomic robot, so it fades
-in trainings as a unicycle.
+drive a unicycle in the same start scenes. M_IN's and M_OUT's teacher, a rule for a holonomic robot, fades in trainings
+as a unicycle.
 
 python -m tests.benchmarks.unicycle_learned
 """
