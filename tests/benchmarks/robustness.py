@@ -65,7 +65,15 @@ SHOWN = (("position_loss", 0.0), ("position_loss", 0.5), ("position_noise_m", 0.
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    return study_parser("tests.benchmarks.robustness", __doc__, 300, Path("runs/robustness")).parse_args(arguments)
+    parser = study_parser("tests.benchmarks.robustness", __doc__, 300, Path("runs/robustness"))
+    names = [axis.name for axis in AXES]
+    parser.add_argument("--conditions", nargs="+", choices=names, default=names, help="to play under")
+    return parser.parse_args(arguments)
+
+
+def axes_of(options: argparse.Namespace) -> list[Axis]:
+    """The conditions to play under."""
+    return [axis for axis in AXES if axis.name in options.conditions]
 
 
 def run_name(method: str, kind: str, seed: int) -> str:
@@ -113,7 +121,7 @@ def curves(method: str, names: list[str], options: argparse.Namespace) -> Iterat
         name: [names.index(name)] for name in names if name in list(Baseline)
     }
     seeds = list(range(options.first_seed, options.first_seed + options.episodes))
-    for axis in AXES:
+    for axis in axes_of(options):
         targets = find_players(Stress(run=tuple(names), runs_dir=options.runs_dir))
         folder = options.runs_dir / "played"
         results = StressResults(folder, targets, [axis], grid([axis]), seeds)
@@ -136,7 +144,8 @@ def table(method: str, found: list[Curve], options: argparse.Namespace) -> Table
     for name in ("setup", "condition", *players):
         result.add_column(name, justify="left" if name in ("setup", "condition") else "right")
     for setup in clean:
-        for number, (axis, value) in enumerate(SHOWN):
+        shown = [condition for condition in SHOWN if condition[0] in options.conditions]
+        for number, (axis, value) in enumerate(shown):
             at = {curve.player: curve for curve in found if (curve.axis.name, curve.setup) == (axis, setup)}
             row = at[CLEAN].axis.values.index(value)
             texts = []
@@ -155,7 +164,7 @@ def breaks(method: str, found: list[Curve]) -> Table:
     for name in ("setup", "condition", *players):
         result.add_column(name, justify="left" if name in ("setup", "condition") else "right")
     for setup in dict.fromkeys(curve.setup for curve in found):
-        for axis in AXES:
+        for axis in dict.fromkeys(curve.axis for curve in found):
             points = [
                 breaking_point(axis.values, [rate.value for rate in curve.rates])
                 for curve in found
@@ -183,7 +192,8 @@ def main(arguments: list[str] | None = None) -> int:
         found = list(curves(method, train(method, options), options))
         console.print(table(method, found, options))
         console.print(breaks(method, found))
-        path = options.runs_dir / method
+        everything = len(axes_of(options)) == len(AXES)
+        path = options.runs_dir / (method if everything else f"{method}-{'-'.join(options.conditions)}")
         write(path.with_suffix(".csv"), method, found)
         panels = [
             Panel(
@@ -191,7 +201,7 @@ def main(arguments: list[str] | None = None) -> int:
                 axis.values,
                 {c.player: c.rates for c in found if (c.axis, c.setup) == (axis, setup)},
             )
-            for axis in AXES
+            for axis in axes_of(options)
             for setup in dict.fromkeys(curve.setup for curve in found)
         ]
         stress_curves_png(panels, path.with_suffix(".png"), f"{find(METHODS, method).label}: success under bad senses")

@@ -34,6 +34,14 @@ def test_differences_are_paired_with_the_clean_policy_without_conditions():
     assert clean[1].startswith("45.0: -45.0 (-49.") and drawn[0].startswith("45.0: -45.0 (-49.")
 
 
+def test_one_condition_alone_can_be_played():
+    options = parse(["--conditions", "position_loss"])
+    assert [axis.name for axis in robustness.axes_of(options)] == ["position_loss"]
+    found = [curve for curve in curves() if curve.axis.name == "position_loss"]
+    assert columns(robustness.table("in", found, options))[1] == ["none", "position_loss 0.5"]
+    assert columns(robustness.breaks("in", found))[1] == ["position_loss"]
+
+
 def test_a_player_breaks_where_its_mean_falls_to_a_half():
     _, axes, clean, drawn = columns(robustness.breaks("in", curves()))
     assert axes == [axis.name for axis in AXES]
@@ -50,9 +58,6 @@ def test_the_file_has_every_point_with_its_interval(tmp_path):
 
 def test_trainings_differ_in_what_their_names_say():
     assert len(set(KINDS.values())) == len(KINDS)
-    assert [("--history" in KINDS[kind], "--track-steps" in KINDS[kind]) for kind in KINDS] == [
-        (False, False),
-        (False, False),
-        (True, False),
-        (False, True),
-    ]
+    flags = ("--history", "--track-steps", "--shield")
+    named = [{flag for flag in flags if flag.split("-")[2] in kind} for kind in KINDS]
+    assert [{flag for flag in flags if flag in KINDS[kind]} for kind in KINDS] == named
