@@ -35,6 +35,19 @@ BEST_WORLD: dict[str, Any] = {
     "horizon_is": "failure",
 }
 BEST = Preset({"discount": 0.985, "policy_average_updates": 1_000, "random_turns": True}, BEST_WORLD)
+GENERALIST = Preset(
+    {
+        "discount": 0.99,
+        "n_step": 6,
+        "network": "dueling",
+        "hidden_sizes": (256, 256),
+        "policy_average_updates": 5_000,
+        "random_turns": True,
+        "total_env_steps": 800_000,
+        "learning_rate_decay_env_steps": 800_000,
+    },
+    BEST_WORLD,
+)
 
 
 class SensorParams(NamedTuple):
@@ -158,7 +171,7 @@ class SensorMethod(Method):
     presets = {
         "thesis": Preset({"n_step": 1, "samples_per_insert": 1.5}, WORLD),
         "best": BEST,
-        "generalist": BEST,
+        "generalist": GENERALIST,
     }
     robot_module = "learner.export.m_sensor:SensorRobot"
 
