@@ -26,9 +26,9 @@ a smaller rate, and
 - M_IN decides in every step: nothing but its own decisions keeps it from robots that do not avoid it.
 - M_IN and M_OUT have a rule of theirs as a teacher (`field`, `greedy`), and learn from turned transitions.
 
-`generalist` is `best` for one policy that learns all setups of the dissertation at once. M_sensor's has a wider, dueling
-network, looks further ahead, and averages its weights over a quarter of a short training: with more env steps or more
-updates it gets worse.
+`generalist` is `best` for one policy that learns all setups of the dissertation at once. For M_sensor it has a wider,
+dueling network, looks further ahead, and averages its weights over a quarter of a short training: with more env steps or
+more updates it gets worse.
 
 What a preset sets for one method alone stands with the method (`Method.presets`).
 """
