@@ -27,8 +27,8 @@ a smaller rate, and
 - M_IN and M_OUT have a rule of theirs as a teacher (`field`, `greedy`), and learn from turned transitions.
 
 `generalist` is `best` for one policy that learns all setups of the dissertation at once. For M_sensor it has a wider,
-dueling network, looks further ahead, and averages its weights over a quarter of a short training: with more env steps or
-more updates it gets worse.
+dueling network, looks further ahead, and averages its weights over a quarter of a short training: with more env
+steps or more updates it gets worse.
 
 What a preset sets for one method alone stands with the method (`Method.presets`).
 """
