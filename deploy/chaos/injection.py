@@ -206,8 +206,9 @@ class ChaosRun:
             self._server_back_s = 0.0
             self.server.start_again()
         fault, mark, writers = self._outage
-        replaced = fault.kind.victim == MLFLOW or self.driver.children(TRACKER) not in ([], writers)
-        if replaced and PushedMark.value(self.folder.pushed) > mark:
+        if PushedMark.value(self.folder.pushed) <= mark:
+            return
+        if fault.kind.victim == MLFLOW or self.driver.children(TRACKER) not in ([], writers):
             self.outages.append(fault._replace(recovery_s=time.time() - fault.time_s))
             self._outage = None
 

@@ -268,8 +268,8 @@ def make_baseline_cell(sweep: SweepConfig, baseline: BaselineName, method: str, 
         device="cpu",
         final_eval_episodes=sweep.baseline_episodes,
         final_eval_first_seed=sweep.first_seed,
+        **ORIGINAL_DEFAULTS,
     )
-    config = dataclasses.replace(config, **ORIGINAL_DEFAULTS)
     name = config.world.method_name
     return Cell(f"{baseline}-{name}-{robots}r{groups}g-{cell_hash(config)}", config, baseline)
 

@@ -37,12 +37,12 @@ BEST_WORLD: dict[str, Any] = {
 BEST = Preset({"discount": 0.985, "policy_average_updates": 1_000, "random_turns": True}, BEST_WORLD)
 GENERALIST = Preset(
     {
+        **BEST.training,
         "discount": 0.99,
         "n_step": 6,
         "network": "dueling",
         "hidden_sizes": (256, 256),
         "policy_average_updates": 5_000,
-        "random_turns": True,
         "total_env_steps": 800_000,
         "learning_rate_decay_env_steps": 800_000,
     },

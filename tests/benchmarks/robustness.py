@@ -29,6 +29,7 @@ from deploy.options.results import Stress
 from deploy.playing.players import find_players
 from deploy.playing.stress_results import StressResults
 from learner.run_folder import RunFolder
+from sim_core.config import WorldConfig
 from sim_core.plugins import METHODS, find
 from tests.benchmarks.trainings import study_parser, trained
 
@@ -90,6 +91,11 @@ def training(method: str, kind: str, seed: int, settings: tuple[str, ...], optio
     return trained(options.runs_dir, name, [*common, "--seed", str(seed), *settings, *options.train])
 
 
+def rules_of(world: WorldConfig) -> list[Baseline]:
+    """The rules that play in such a world."""
+    return [rule for rule in (Baseline.GREEDY, Baseline.FIELD, Baseline.FL_ORCA) if exists(rule, world)]
+
+
 def train(method: str, options: argparse.Namespace) -> list[str]:
     """Names of all trainings, which are made unless they are there, and of the rules."""
     names = []
@@ -97,7 +103,7 @@ def train(method: str, options: argparse.Namespace) -> list[str]:
         for kind, settings in KINDS.items():
             names.append(run_name(method, kind, seed))
             world = training(method, kind, seed, settings, options).config().world
-    return [*names, *(str(rule) for rule in (Baseline.GREEDY, Baseline.FIELD, Baseline.FL_ORCA) if exists(rule, world))]
+    return [*names, *map(str, rules_of(world))]
 
 
 class Curve(NamedTuple):
@@ -143,8 +149,8 @@ def table(method: str, found: list[Curve], options: argparse.Namespace) -> Table
     result = Table(title=f"{title}; {len(options.seeds)} trainings, {options.episodes} episodes")
     for name in ("setup", "condition", *players):
         result.add_column(name, justify="left" if name in ("setup", "condition") else "right")
+    shown = [condition for condition in SHOWN if condition[0] in options.conditions]
     for setup in clean:
-        shown = [condition for condition in SHOWN if condition[0] in options.conditions]
         for number, (axis, value) in enumerate(shown):
             at = {curve.player: curve for curve in found if (curve.axis.name, curve.setup) == (axis, setup)}
             row = at[CLEAN].axis.values.index(value)

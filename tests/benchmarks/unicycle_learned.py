@@ -17,14 +17,13 @@ from rich.table import Table
 
 from actors.evaluation.evaluator import Candidate
 from actors.evaluation.statistics import mean
-from actors.policy.baselines import Baseline, exists
 from actors.rollout.env_spec import EnvSpec
 from deploy.console.summary_tables import signed_percent
 from deploy.runs.policy_lookup import find_policy
 from sim_core import ENV_ID
 from sim_core.outcomes import Outcome
 from sim_core.plugins import METHODS, find
-from tests.benchmarks.robustness import CLEAN, FADES, training
+from tests.benchmarks.robustness import CLEAN, FADES, rules_of, training
 from tests.benchmarks.trainings import study_parser
 from tests.benchmarks.unicycle import LIMITS
 
@@ -34,13 +33,11 @@ DRIVING = (
     *("--kinematics", "unicycle", "--turn-rate-limit-deg-s", str(TURN_DEG_S)),
     *("--acceleration-limit-m-s2", str(ACCELERATION_M_S2)),
 )
-RULES = (Baseline.GREEDY, Baseline.FIELD, Baseline.FL_ORCA)
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    return study_parser("tests.benchmarks.unicycle_learned", __doc__, 1_000, Path("runs/robustness")).parse_args(
-        arguments
-    )
+    parser = study_parser("tests.benchmarks.unicycle_learned", __doc__, 1_000, Path("runs/robustness"))
+    return parser.parse_args(arguments)
 
 
 def outcomes(method: str, options: argparse.Namespace) -> dict[str, dict[str, np.ndarray]]:
@@ -52,11 +49,10 @@ def outcomes(method: str, options: argparse.Namespace) -> dict[str, dict[str, np
     }
     from learner.ray_backend.cluster import evaluate_in_tasks  # imports Ray, which `shoal train` configures first
 
-    config = runs[TRAINED][0].config()
-    worlds = config.env.worlds
+    worlds = runs[TRAINED][0].config().env.worlds
     players: dict[str, list[Candidate]] = {
         name: [find_policy(folder, folder.config()) for folder in folders] for name, folders in runs.items()
-    } | {str(rule): [rule] for rule in RULES if exists(rule, config.world)}
+    } | {str(rule): [rule] for rule in rules_of(worlds[0])}
     seeds = list(range(options.first_seed, options.first_seed + options.episodes))
     unicycles = [EnvSpec(ENV_ID, world) for world in worlds]
     found: dict[str, dict[str, np.ndarray]] = {world.setup: {} for world in worlds}

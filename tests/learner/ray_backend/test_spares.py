@@ -94,7 +94,8 @@ def test_a_spare_shard_that_has_begun_is_empty_and_stores():
 
 def is_seen_as(pid, *kinds):
     """Whether the title of a process is that of a component of one of the kinds."""
-    return any(is_of_kind(psutil.Process(pid).cmdline(), kind) for kind in kinds)
+    words = psutil.Process(pid).cmdline()
+    return any(is_of_kind(words, kind) for kind in kinds)
 
 
 def wait_until(condition):
