@@ -13,8 +13,8 @@ from actors.replay.node import ShardNode, ShardSettings
 from actors.rollout.worker import join_stats
 from actors.service.messages import SCHEMA_VERSION, BlockHeader, TransitionBlock, transition_dtype
 from learner.config import RunConfig
-from tests.benchmarks.ray_service import ray_service
 from tests.benchmarks.timing import spread
+from tests.benchmarks.whole_service import whole_service
 from tests.checkpointing import Silent
 from tests.packed import pack_as_collected
 
@@ -93,7 +93,7 @@ def service_rows(config: RunConfig) -> list[tuple[str, list[float]]]:
     told = Told()
     stalls, quiet, writing = [], [], []
     last = (0.0, 0)
-    with ray_service(config) as make_loop:
+    with whole_service(config) as make_loop:
 
         def stop() -> bool:
             nonlocal last

@@ -17,7 +17,6 @@ import numpy as np
 
 import sim_core  # noqa: F401  registers our environment, in whatever process this is
 from actors.evaluation.evaluator import evaluate
-from actors.policy.network import snapshot
 from actors.policy.policy import WeightsSnapshot
 from actors.rollout.env_spec import EnvSpec
 from learner.config import RunConfig, from_dict, to_dict
@@ -139,6 +138,8 @@ def compete(train: Callable[[Heat], Finding]) -> None:
 
 def policy_of(network: Any) -> WeightsSnapshot:
     """A peer's Q-network for the judge: a PyTorch module whose parameters are those of our plain network."""
+    from actors.policy.network import snapshot  # PyTorch, which our driver over Ray does not import
+
     return snapshot(network, 0, 0.0)
 
 

@@ -26,6 +26,8 @@ TWO_WORKERS = "2 workers"
 SHORT_BLOCKS = "short blocks"
 """A style of ours: blocks and calls of updates as short as in the presets (`learner.presets`). The learner begins
 earlier, and more messages are sent."""
+ONE_PROCESS = "one process"
+"""A style of ours: without Ray, which takes seconds to start."""
 
 
 class Contest(NamedTuple):
@@ -40,7 +42,9 @@ class Contest(NamedTuple):
         shape = env_shape(config.env)
         what = f"{config.world.method} {config.world.setup}" if config.env.is_swarm else config.env_id
         sizes = "-".join(map(str, (shape.observation_size, *config.hidden_sizes, shape.num_actions)))
-        return f"{what}, {sizes}, batch {config.batch_size}, {config.samples_per_insert:g} samples per insert"
+        steps = config.world.decision_interval_steps
+        often = f", a decision every {steps} steps" if steps > 1 else ""
+        return f"{what}{often}, {sizes}, batch {config.batch_size}, {config.samples_per_insert:g} samples per insert"
 
 
 class Style(NamedTuple):
@@ -64,7 +68,8 @@ class Contender(NamedTuple):
         if self.module == "limit":
             return [Style(envs, 1) for envs in (16, 64, 128)]
         if self.module == "shoal":
-            kinds = ("", TWO_WORKERS, SHORT_BLOCKS, f"{TWO_WORKERS}, {SHORT_BLOCKS}")
+            placed = ("", TWO_WORKERS, ONE_PROCESS)
+            kinds = [", ".join(filter(None, (place, blocks))) for place in placed for blocks in ("", SHORT_BLOCKS)]
             return [Style(envs, 1, kind) for kind in kinds for envs in (64, 128)]
         if self.module == "sb3":
             kinds = ("", "vectorised") if contest.config.env.is_swarm else ("",)
@@ -76,7 +81,8 @@ def contests() -> dict[str, Contest]:
     cartpole = from_dict(tomllib.loads((ROOT / "deploy/configs/cartpole.toml").read_text("utf-8")))
     often = {"eval_every_env_steps": 10_000, "eval_episodes": 200, "checkpoint_every_env_steps": 10**9}
     seldom = {"total_env_steps": 10**8, "eval_every_env_steps": 10**9, "checkpoint_every_env_steps": 10**9}
-    swarm = RunConfig(world=WorldConfig(decision_interval_steps=4))  # as the preset `best` decides
+    swarm = RunConfig()
+    spaced = RunConfig(world=WorldConfig(decision_interval_steps=4))  # as the preset `best` decides
     wide = RunConfig(world=WorldConfig(method="in", robots=5, groups=8))
     return {
         "cartpole": Contest(
@@ -88,6 +94,10 @@ def contests() -> dict[str, Contest]:
             475.0,
         ),
         "swarm": Contest(
+            dataclasses.replace(spaced, **often),
+            0.85,
+        ),
+        "swarm-every-step": Contest(
             dataclasses.replace(swarm, **often),
             0.85,
         ),

@@ -3,17 +3,19 @@
 Each contest sets the environment, the network, the batch and the samples per insert. Every contender trains in a
 process of its own, one at a time, in turn. Measured are rates (env steps and updates a second once training has begun)
 and the time to a threshold: from the start of the training, environments and Ray being up, to the first evaluation that
-reaches it. The watch stands still while the judge plays, and so does the training. Before each of the two, every
-contender tries several numbers of environments and threads and keeps what serves it best there. "The limit" is no
-contender: what bare simulation and bare updates would leave time for on this machine. The last table has all of it as
-ratios.
+reaches it; and the same from the start of the contender's process. The watch stands still while the judge plays, and so
+does the training. Before each of the three, every contender tries several numbers of environments and threads, ours
+with Ray and without, and keeps what serves it best there. "The limit" is no contender: what bare simulation and bare
+updates would leave time for on this machine. The last table has all of it as ratios.
 """
 
 import argparse
 import dataclasses
 import statistics
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table
@@ -42,17 +44,25 @@ def fastest(name: str, contender: Contender, contest: Contest, console: Console)
     return max((Entry(name, contender, style) for style in contender.styles(contest)), key=rate)
 
 
-def soonest(name: str, contender: Contender, contest: Contest, limit_s: float, console: Console) -> Entry:
-    """The contender in the style that reaches the threshold in the least time."""
+class Soonest(NamedTuple):
+    """A contender in the style of the least time to the threshold, and in that of the least time from its start."""
+
+    trained: Entry
+    started: Entry
+
+
+def soonest(name: str, contender: Contender, contest: Contest, limit_s: float, console: Console) -> Soonest:
+    """What serves a contender best, by trainings that do not count."""
     trials = [dataclasses.replace(contest.config, seed=seed) for seed in TRIAL_SEEDS]
-
-    def seconds(entry: Entry) -> float:
-        found = {entry: [entry.run(config, limit_s, contest.threshold) for config in trials]}
-        mean_s = statistics.fmean(seconds_of(found, limit_s)[name])
-        console.print(f"  {name}, {entry.style.text()}: {mean_s:.1f} s to {contest.threshold:g}")
-        return mean_s
-
-    return min((Entry(name, contender, style) for style in contender.styles(contest)), key=seconds)
+    trained, started = {}, {}
+    for style in contender.styles(contest):
+        entry = Entry(name, contender, style)
+        found = [entry.run(config, limit_s, contest.threshold) for config in trials]
+        trained[entry] = statistics.fmean(seconds_of(found, limit_s))
+        started[entry] = statistics.fmean(seconds_from_start(found, limit_s))
+        texts = f"{trained[entry]:.1f} s to {contest.threshold:g}, {started[entry]:.1f} s with start-up"
+        console.print(f"  {name}, {style.text()}: {texts}")
+    return Soonest(min(trained, key=trained.__getitem__), min(started, key=started.__getitem__))
 
 
 def rate_table(contest: Contest, found: dict[Entry, list[Finding]]) -> Table:
@@ -71,34 +81,30 @@ def rate_table(contest: Contest, found: dict[Entry, list[Finding]]) -> Table:
 
 def threshold_table(contest: Contest, found: dict[Entry, list[Finding]], limit_s: float) -> Table:
     table = Table(title=f"{contest.title}: seconds to {contest.threshold:g}, median (lowest … highest)")
-    for column in ("contender", "its best", "reached", "seconds", "with start-up", "env steps", "it / shoal"):
+    for column in ("contender", "its best", "reached", "seconds", "with start-up", "env steps"):
         table.add_column(column, justify="left" if column in ("contender", "its best") else "right")
-    waits = seconds_of(found, limit_s)
     for entry, findings in found.items():
-        seconds = waits[entry.name]
         reached = sum(finding.to_threshold_s is not None for finding in findings)
         least = "" if reached == len(findings) else AT_LEAST
-        whole = spread([one + finding.start_up_s for one, finding in zip(seconds, findings, strict=True)])
-        env_steps = spread([finding.env_steps for finding in findings])
-        against = "" if entry.name == OURS else least + ratio(seconds, waits[OURS]).text(1)
         table.add_row(
             entry.name,
             entry.style.text(),
             f"{reached} of {len(findings)}",
-            least + spread(seconds).text(1),
-            least + whole.text(1),
-            env_steps.text(),
-            against,
+            least + spread(seconds_of(findings, limit_s)).text(1),
+            least + spread(seconds_from_start(findings, limit_s)).text(1),
+            spread([finding.env_steps for finding in findings]).text(),
         )
     return table
 
 
-def seconds_of(found: dict[Entry, list[Finding]], limit_s: float) -> dict[str, list[float]]:
-    """Times to the threshold by contender, the limit where it was not reached."""
-    return {
-        entry.name: [limit_s if one.to_threshold_s is None else one.to_threshold_s for one in findings]
-        for entry, findings in found.items()
-    }
+def seconds_of(findings: list[Finding], limit_s: float) -> list[float]:
+    """Times to the threshold, the limit where it was not reached."""
+    return [limit_s if finding.to_threshold_s is None else finding.to_threshold_s for finding in findings]
+
+
+def seconds_from_start(findings: list[Finding], limit_s: float) -> list[float]:
+    """The same from the start of the contender's process."""
+    return [wait + one.start_up_s for wait, one in zip(seconds_of(findings, limit_s), findings, strict=True)]
 
 
 def rate_ratios(contest: Contest, found: dict[Entry, list[Finding]]) -> dict[str, str]:
@@ -108,18 +114,33 @@ def rate_ratios(contest: Contest, found: dict[Entry, list[Finding]]) -> dict[str
     return {"": f"{contest.title}: env steps/s", **others}
 
 
-def time_ratios(contest: Contest, found: dict[Entry, list[Finding]], limit_s: float) -> dict[str, str]:
-    """A line of the last table: each other's time to the threshold over ours, where ours reached it in all rounds."""
-    waits = seconds_of(found, limit_s)
-    late = {entry.name for entry, findings in found.items() if any(one.to_threshold_s is None for one in findings)}
-    if OURS in late:
-        return {"": f"the same: time to {contest.threshold:g}, which shoal did not always reach"}
-    others = {
-        name: (AT_LEAST if name in late else "") + ratio(theirs, waits[OURS]).text(2)
-        for name, theirs in waits.items()
-        if name != OURS
-    }
-    return {"": f"the same: time to {contest.threshold:g}", **others}
+def time_ratios(
+    contest: Contest, players: list[Soonest], found: dict[Entry, list[Finding]], limit_s: float
+) -> list[dict[str, str]]:
+    """Lines of the last table: each other's time to the threshold over ours, where ours reached it in all rounds.
+
+    The first line is the training's time alone, the second counts the start-up.
+    """
+
+    def line(
+        title: str, entries: list[Entry], seconds: Callable[[list[Finding], float], list[float]]
+    ) -> dict[str, str]:
+        late = {entry.name for entry in entries if any(one.to_threshold_s is None for one in found[entry])}
+        waits = {entry.name: seconds(found[entry], limit_s) for entry in entries}
+        if OURS in late:
+            return {"": f"{title}, which shoal did not always reach"}
+        others = {
+            name: (AT_LEAST if name in late else "") + ratio(theirs, waits[OURS]).text(2)
+            for name, theirs in waits.items()
+            if name != OURS
+        }
+        return {"": title, **others}
+
+    title = f"{contest.title}: time to {contest.threshold:g}"
+    return [
+        line(title, [player.trained for player in players], seconds_of),
+        line(f"{title}, with start-up", [player.started for player in players], seconds_from_start),
+    ]
 
 
 def last_table(lines: list[dict[str, str]]) -> Table:
@@ -138,10 +159,12 @@ def hold(
 ) -> list[dict[str, str]]:
     """Runs one contest and prints its tables; returns the lines of the last one."""
     console.print(contest.title)
-    entries = [fastest(name, contender, contest, console) for name, contender in field.items()]
-    found = in_turn(entries, [contest.config] * options.rounds, options.seconds, None)
-    console.print(rate_table(contest, found))
-    lines = [rate_ratios(contest, found)]
+    lines = []
+    if not options.times_only:
+        entries = [fastest(name, contender, contest, console) for name, contender in field.items()]
+        found = in_turn(entries, [contest.config] * options.rounds, options.seconds, None)
+        console.print(rate_table(contest, found))
+        lines.append(rate_ratios(contest, found))
     if contest.threshold is not None:
         seeds = [dataclasses.replace(contest.config, seed=seed) for seed in range(options.rounds)]
         players = [
@@ -149,9 +172,10 @@ def hold(
             for name, contender in field.items()
             if name != LIMIT
         ]
-        found = in_turn(players, seeds, options.limit_s, contest.threshold)
+        entries = list(dict.fromkeys(entry for player in players for entry in player))
+        found = in_turn(entries, seeds, options.limit_s, contest.threshold)
         console.print(threshold_table(contest, found, options.limit_s))
-        lines.append(time_ratios(contest, found, options.limit_s))
+        lines += time_ratios(contest, players, found, options.limit_s)
     return lines
 
 
@@ -175,6 +199,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--rounds", type=int, default=3, help="of every measurement; of the threshold, seeds")
     parser.add_argument("--seconds", type=float, default=15.0, help="that a rate is measured for")
     parser.add_argument("--limit-s", type=float, default=600.0, help="after which a threshold counts as not reached")
+    parser.add_argument("--times-only", action="store_true", help="measure times to a threshold, and no rates")
     options = parser.parse_args(arguments)
     for name in options.contests:
         if name not in known:

@@ -21,9 +21,9 @@ from rich.table import Table
 
 from learner.config import RunConfig
 from tests.benchmarks.processes import processes_of_the_run
-from tests.benchmarks.ray_service import ENDLESS, WARM_S, ray_service
 from tests.benchmarks.service import SAMPLES_PER_INSERT, learner_work, limited_configs
 from tests.benchmarks.timing import spread, stopwatch, timed_rates
+from tests.benchmarks.whole_service import ENDLESS, WARM_S, whole_service
 from tests.checkpointing import Silent
 
 SECONDS, RATE_HZ = 30, 100
@@ -166,7 +166,7 @@ class Spy(threading.Thread):
 def costs_of(config: RunConfig) -> Costs:
     """CPU time of an update, by process and work, the most first."""
     spies: list[Spy] = []
-    with ray_service(config) as make_loop:
+    with whole_service(config) as make_loop:
 
         def stop() -> bool:
             if loop.updates and not spies:

@@ -15,7 +15,6 @@ from actors.service.packing import estimate_frames, packed_dtype
 from learner.config import RunConfig
 from learner.update.learner import Learner
 from tests.benchmarks.hop_costs import measured_costs
-from tests.benchmarks.ray_service import ENDLESS, Point, measured_point
 from tests.benchmarks.service_model import (
     LEARNER,
     MANY,
@@ -29,6 +28,7 @@ from tests.benchmarks.service_model import (
     shards_needed,
 )
 from tests.benchmarks.several_learners import learners_table, sum_seconds, update_seconds
+from tests.benchmarks.whole_service import ENDLESS, Point, measured_point
 
 POINTS = ((1, 2.0), (2, 2.0), (4, 2.0), (8, 2.0), (1, 0.25), (2, 0.25), (1, 8.0), (2, 8.0))
 """Rollout workers and samples per insert that are measured."""

@@ -18,8 +18,8 @@ from learner.training.cluster import rollout_settings
 from learner.update.learner import Learner
 from sim_core.config import WorldConfig
 from tests.benchmarks.entrants import contests
-from tests.benchmarks.ray_service import ENDLESS, Point, measured_point
 from tests.benchmarks.timing import rates, ratio, spread, stopwatch, sustained, timed_rates
+from tests.benchmarks.whole_service import ENDLESS, Point, measured_point
 
 ROUNDS = 5
 SERVICE_S = 20.0

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 from stable_baselines3.common.env_util import make_vec_env
 
 from actors.policy.network import QNetwork
@@ -132,24 +133,58 @@ def test_the_limit_is_one_core_for_the_learner_and_all_cores_for_everything():
     assert most_updates(config, env_steps_per_s=100.0, updates_per_s=20.0, cores=2) == pytest.approx(2 / (0.1 + 0.05))
 
 
+MADE = Finding(600.0, 1.0, 0.0, 2.0, 10, 0.9)
+"""Of a training that reached the threshold after two seconds."""
+SWARM = entrants.contests()["swarm"]
+
+
+def entry_of(name, kind=""):
+    return entrants.Entry(name, entrants.Contender("x"), entrants.Style(1, 1, kind))
+
+
 def test_the_last_table_has_what_ours_is_to_each():
-    ours, other = (entrants.Entry(name, entrants.Contender("x"), entrants.Style(1, 1)) for name in ("shoal", "other"))
-    made = Finding(600.0, 1.0, 0.0, 2.0, 10, 0.9)
-    slower = [made._replace(env_steps_per_s=rate, to_threshold_s=time_s) for rate, time_s in ((300, 4.0), (100, None))]
-    found = {ours: [made, made], other: slower}
-    contest = entrants.contests()["swarm"]
-    assert peers.rate_ratios(contest, found)["other"] == "4.00 (2.00 … 6.00)"
-    assert peers.time_ratios(contest, found, 20.0)["other"] == "≥ 6.00 (2.00 … 10.00)"
-    found[ours][0] = made._replace(to_threshold_s=None)
-    assert "other" not in peers.time_ratios(contest, found, 20.0)
+    ours, other = entry_of("shoal"), entry_of("other")
+    slower = [MADE._replace(env_steps_per_s=rate, to_threshold_s=time_s) for rate, time_s in ((300, 4.0), (100, None))]
+    found = {ours: [MADE, MADE], other: slower}
+    players = [peers.Soonest(entry, entry) for entry in found]
+    assert peers.rate_ratios(SWARM, found)["other"] == "4.00 (2.00 … 6.00)"
+    assert peers.time_ratios(SWARM, players, found, 20.0)[0]["other"] == "≥ 6.00 (2.00 … 10.00)"
+    found[ours][0] = MADE._replace(to_threshold_s=None)
+    assert "other" not in peers.time_ratios(SWARM, players, found, 20.0)[0]
+
+
+def test_times_with_the_start_up_are_those_of_the_style_that_is_soonest_from_its_start():
+    quick, light, other = entry_of("shoal"), entry_of("shoal", entrants.ONE_PROCESS), entry_of("other")
+    found = {
+        quick: [MADE._replace(start_up_s=8.0)],
+        light: [MADE._replace(to_threshold_s=4.0, start_up_s=1.0)],
+        other: [MADE._replace(to_threshold_s=16.0, start_up_s=4.0)],
+    }
+    alone, whole = peers.time_ratios(SWARM, [peers.Soonest(quick, light), peers.Soonest(other, other)], found, 20.0)
+    assert (alone["other"], whole["other"]) == ("8.00 (8.00 … 8.00)", "4.00 (4.00 … 4.00)")
+    assert whole[""] == f"{alone['']}, with start-up"
+
+
+def test_a_contender_chooses_a_style_for_each_time(monkeypatch):
+    spent = {("", 64): (2.0, 8.0), (entrants.ONE_PROCESS, 64): (3.0, 1.0)}
+
+    def run(entry, config, seconds, threshold):
+        wait_s, start_up_s = spent.get((entry.style.variant, entry.style.envs), (9.0, 9.0))
+        return MADE._replace(to_threshold_s=wait_s, start_up_s=start_up_s)
+
+    monkeypatch.setattr(entrants.Entry, "run", run)
+    found = peers.soonest("shoal", entrants.Contender("shoal"), SWARM, 20.0, Console(quiet=True))
+    assert (found.trained.style.variant, found.started.style.variant) == ("", entrants.ONE_PROCESS)
 
 
 @pytest.mark.ray
 @pytest.mark.slow
-@pytest.mark.parametrize("module", ["shoal", "sb3", "limit"])
-def test_contenders_draw_as_many_samples_per_insert_as_they_are_told(module):
+@pytest.mark.parametrize(
+    ("module", "variant"), [("shoal", ""), ("shoal", entrants.ONE_PROCESS), ("sb3", ""), ("limit", "")]
+)
+def test_contenders_draw_as_many_samples_per_insert_as_they_are_told(module, variant):
     contender = entrants.Contender(module)
-    found = entrants.run_heat(contender, Heat(CARTPOLE, 16, 1, 2.0, None))
+    found = entrants.run_heat(contender, Heat(CARTPOLE, 16, 1, 2.0, None, variant))
     drawn = found.updates_per_s * CARTPOLE.batch_size / found.env_steps_per_s
     assert drawn == pytest.approx(CARTPOLE.samples_per_insert, rel=0.25)
     assert found.start_up_s > 0 or module == "limit"

@@ -1,12 +1,12 @@
-"""Ours, over Ray; the judge takes the place of the service's own evaluations, as with the peers."""
+"""Ours, over Ray or in one process; the judge takes the place of the service's own evaluations, as with the peers."""
 
 import dataclasses
 
 from actors.policy.policy import WeightsSnapshot
 from learner.presets import preset_config
 from tests.benchmarks.contest import Finding, Heat, Lap, compete
-from tests.benchmarks.entrants import SHORT_BLOCKS, TWO_WORKERS
-from tests.benchmarks.ray_service import ray_service
+from tests.benchmarks.entrants import ONE_PROCESS, SHORT_BLOCKS, TWO_WORKERS
+from tests.benchmarks.whole_service import whole_service
 from tests.checkpointing import Silent
 
 
@@ -17,7 +17,9 @@ def train(heat: Heat) -> Finding:
         preset = preset_config("best", config.world.method)
         blocks = {"steps_per_block": preset.steps_per_block, "updates_per_call": preset.updates_per_call}
         config = dataclasses.replace(config, **blocks)
-    with ray_service(config) as make_loop:
+    if ONE_PROCESS in heat.variant:
+        config = dataclasses.replace(config, engine="process")
+    with whole_service(config) as make_loop:
 
         def weights() -> WeightsSnapshot:
             loop.settle()  # or workers and learner would go on while the watch stands still

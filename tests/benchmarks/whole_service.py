@@ -1,4 +1,4 @@
-"""The whole service over Ray, for benchmarks that watch its training loop."""
+"""The whole service under a run's engine, for benchmarks that watch its training loop."""
 
 import math
 import statistics
@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 from learner.cluster_options import ClusterOptions
 from learner.config import RunConfig
+from learner.engine import open_cluster
 from learner.loop import Observer, TrainingLoop
-from learner.ray_backend.cluster import RayCluster
 from learner.tracking.journal import Journal
 from tests.benchmarks.processes import cpu_seconds
 from tests.checkpointing import Silent
@@ -26,9 +26,9 @@ WARM_S = 3.0
 
 
 @contextmanager
-def ray_service(config: RunConfig) -> Iterator[Callable[[Observer, Callable[[], bool]], TrainingLoop]]:
+def whole_service(config: RunConfig) -> Iterator[Callable[[Observer, Callable[[], bool]], TrainingLoop]]:
     """Starts the parts of a run; what it gives makes the loop from an observer and a question whether to stop."""
-    cluster = RayCluster(config, 0, ClusterOptions())
+    cluster = open_cluster(config, 0, ClusterOptions())
     try:
         with tempfile.TemporaryDirectory() as folder, closing(Journal(Path(folder) / "m.jsonl", 0)) as journal:
             checkpoints = Path(folder) / "checkpoints"
@@ -62,10 +62,10 @@ class Rows(Silent):
 
 
 def measured_point(config: RunConfig, seconds: float) -> Point:
-    """The service over Ray in its steady state, looked at for so many seconds."""
+    """The service in its steady state, looked at for so many seconds."""
     marks: list[tuple[float, int, int, dict[str, float]]] = []
     observer = Rows()
-    with ray_service(config) as make_loop:
+    with whole_service(config) as make_loop:
         begun_s: list[float] = []
 
         def mark() -> None:
