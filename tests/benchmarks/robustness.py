@@ -87,6 +87,7 @@ def training(method: str, kind: str, seed: int, settings: tuple[str, ...], optio
     common = ["--preset", "generalist", "--method", method, "--engine", "process", "--setups", *SETUPS]
     common += ["--total-env-steps", steps, "--learning-rate-decay-env-steps", steps]
     common += ["--eval-every-env-steps", steps, "--checkpoint-every-env-steps", steps]
+    common += ["--eval-episodes", "100", "--final-eval-episodes", "100"]  # the study plays its own
     name = run_name(method, kind, seed)
     return trained(options.runs_dir, name, [*common, "--seed", str(seed), *settings, *options.train])
 
