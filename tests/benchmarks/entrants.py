@@ -70,7 +70,7 @@ class Contender(NamedTuple):
         if self.module == "shoal":
             placed = ("", TWO_WORKERS, ONE_PROCESS)
             kinds = [", ".join(filter(None, (place, blocks))) for place in placed for blocks in ("", SHORT_BLOCKS)]
-            return [Style(envs, 1, kind) for kind in kinds for envs in (64, 128)]
+            return [Style(envs, 1, kind) for kind in kinds for envs in (64, 128, 256)]
         if self.module == "sb3":
             kinds = ("", "vectorised") if contest.config.env.is_swarm else ("",)
             return [Style(envs, threads, kind) for kind in kinds for envs in (8, 64, 256) for threads in (1, 2)]
