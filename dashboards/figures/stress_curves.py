@@ -13,7 +13,7 @@ from actors.evaluation.conditions import BROKEN
 from actors.evaluation.statistics import Estimate
 from dashboards.figures.style import LINE_STYLES, MARKERS, MUTED, TEXT, escaped, new_figure, save_png, style_axes
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#1C2024")
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#1C2024", "#8A5A2B")
 COLUMNS = 2
 
 
