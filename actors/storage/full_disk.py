@@ -5,8 +5,8 @@ from __future__ import annotations
 import errno
 import os
 
-FULL = (errno.ENOSPC, errno.EDQUOT)
-"""What a write to a full disk, or beyond a quota, fails with."""
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""What a write to a full disk, beyond a quota, or beyond a process's limit on files (`ulimit -f`) fails with."""
 DISK_TIMEOUT_S = 600.0
 """How long a run that is about to end waits for space."""
 _TEXTS = (*map(os.strerror, FULL), "database or disk is full")

@@ -77,6 +77,8 @@ def test_other_errors_are_raised(file, monkeypatch):
     ("error", "is_full"),
     [
         (OSError(errno.ENOSPC, "x"), True),
+        (OSError(errno.EFBIG, "x"), True),
+        (RuntimeError("OSError: [Errno 27] File too large"), True),
         (OSError(errno.EDQUOT, "x"), True),
         (OSError(errno.EACCES, "x"), False),
         (ValueError("Error while serializing: I/O error: No space left on device (os error 28)"), True),
