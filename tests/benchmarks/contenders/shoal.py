@@ -12,13 +12,13 @@ from tests.checkpointing import Silent
 
 def train(heat: Heat) -> Finding:
     workers = 2 if TWO_WORKERS in heat.variant else 1
-    config = dataclasses.replace(heat.config, workers=workers, envs_per_worker=heat.envs, eval_every_env_steps=10**9)
+    engine = "process" if ONE_PROCESS in heat.variant else "ray"
+    ours = {"engine": engine, "workers": workers, "envs_per_worker": heat.envs, "eval_every_env_steps": 10**9}
+    config = dataclasses.replace(heat.config, **ours)
     if SHORT_BLOCKS in heat.variant:
         preset = preset_config("best", config.world.method)
         blocks = {"steps_per_block": preset.steps_per_block, "updates_per_call": preset.updates_per_call}
         config = dataclasses.replace(config, **blocks)
-    if ONE_PROCESS in heat.variant:
-        config = dataclasses.replace(config, engine="process")
     with whole_service(config) as make_loop:
 
         def weights() -> WeightsSnapshot:
