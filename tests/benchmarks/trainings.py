@@ -1,7 +1,6 @@
 """Studies of trainings by `shoal train` that are kept: one that is there is used, one that was cut off goes on."""
 
 import argparse
-import gc
 from pathlib import Path
 
 from deploy.cli import main as shoal
@@ -14,7 +13,6 @@ def trained(runs_dir: Path, name: str, settings: list[str]) -> RunFolder:
     folder = RunFolder(runs_dir / name)
     if shoal(["train", *settings, "--runs-dir", str(runs_dir), "--name", name, "--or-resume", "True"]):
         raise SystemExit(f"the training {folder.path} has not come to its end")
-    gc.collect()  # its replay, 300 MB in cycles, for which a process that imports deploy.cli looks rarely
     return folder
 
 

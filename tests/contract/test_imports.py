@@ -73,3 +73,21 @@ def test_a_process_imports_nothing_that_it_does_not_use(process):
 
 def test_what_is_forbidden_is_found_where_it_is_used():
     assert MEASURED <= modules_after("\n".join(f"import {name}" for name in sorted(MEASURED)))
+
+
+def test_only_the_start_of_shoal_has_python_look_for_cycles_rarely():
+    """A process that imports shoal keeps its own garbage collector, and frees what its trainings leave."""
+    program = "import gc, json\nbefore = gc.get_threshold()\n{}\nprint(json.dumps(gc.get_threshold() == before))"
+    programs = {
+        "imported": program.format("import deploy.cli, deploy.commands.train"),
+        "started": program.format(HELP.format(arguments="").replace("deploy.cli", "deploy.__main__")),
+    }
+    unchanged = {
+        name: json.loads(
+            subprocess.run(
+                [sys.executable, "-c", code, "--help"], capture_output=True, text=True, check=True, timeout=300
+            ).stdout.splitlines()[-1]
+        )
+        for name, code in programs.items()
+    }
+    assert unchanged == {"imported": True, "started": False}
