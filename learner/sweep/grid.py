@@ -47,7 +47,7 @@ class SweepConfig:
     """Fixed: greedy episodes in the setup of the training (3.3: 30 iterations of 100)."""
     extrapolation: Literal["all", "none"] = "all"
     """Extrapolation: every policy in every other setup that it fits (M_IN, M_OUT: equal group count), or none."""
-    extrapolation_episodes: int = 300
+    extrapolation_episodes: int = 100
     """Extrapolation: greedy episodes in each other setup; as many as Fixed where Figures 3.4 to 3.6 draw it."""
     baselines: tuple[BaselineName, ...] = ("fl-orca", "greedy", "field")
     """Rules that do not learn (see `shoal evaluate`), in every setup of the methods that have them; may be empty."""
