@@ -7,6 +7,7 @@ import pytest
 
 import deploy
 from actors.evaluation.result_table import GROUPS, ROBOTS
+from actors.rollout.exploration import epsilon
 from learner.presets import preset_config
 
 EXAMPLES = Path(deploy.__file__).parent / "examples"
@@ -25,7 +26,10 @@ def test_every_setup_of_the_dissertation_is_possible(name, method):
 def test_thesis_has_the_numbers_of_tables_3_2_and_4_2(method):
     config = preset_config("thesis", method, 10, 2)
     world = config.world
-    assert config.learning_rate == 0.001 and config.epsilon_end == 0.05
+    rates = {config.learning_rate_at(step) for step in (0, 100_000, config.total_env_steps)}
+    epsilons = {epsilon(config.epsilon_settings, step, 0, 1) for step in (0, 50_000, config.total_env_steps)}
+    assert rates == {0.001} and epsilons == {0.05} and config.loss == "mse"
+    assert world.captured_is == "surrounded" and world.lost_ends_episode == (method != "sensor")
     assert (world.horizon_steps, world.learner_speed_m_s, world.reward_scale) == (500, 1.0, 1.0)
     assert (world.inner_radius_m, world.outer_radius_m) == (0.5, 1.5)
     assert world.ellipse_chi_square == 5.991 and world.apf_range_m == world.inner_radius_m
@@ -33,15 +37,15 @@ def test_thesis_has_the_numbers_of_tables_3_2_and_4_2(method):
 
 
 OURS = {
-    "sensor": {"sensor_counts", "decision_interval_steps", "horizon_is"},
-    "in": {"ellipse_reward", "apf_gain_m4_s"},
-    "out": {"ellipse_reward", "apf_gain_m4_s", "decision_interval_steps"},
+    "sensor": {"captured_is", "sensor_counts", "decision_interval_steps", "horizon_is"},
+    "in": {"captured_is", "lost_ends_episode", "ellipse_reward", "apf_gain_m4_s"},
+    "out": {"captured_is", "lost_ends_episode", "ellipse_reward", "apf_gain_m4_s", "decision_interval_steps"},
 }
 """World settings in which `best` differs from `thesis`."""
 
 
 @pytest.mark.parametrize("method", OURS)
-def test_best_plays_in_the_world_of_thesis(method):
+def test_best_differs_from_thesis_in_these_settings_of_the_world_alone(method):
     thesis, best = (dataclasses.asdict(preset_config(name, method, 10, 2).world) for name in ("thesis", "best"))
     assert {name for name in thesis if thesis[name] != best[name]} == OURS[method]
 
