@@ -30,7 +30,7 @@ from tests.benchmarks.service_model import (
 from tests.benchmarks.several_learners import learners_table, sum_seconds, update_seconds
 from tests.benchmarks.whole_service import ENDLESS, Point, measured_point
 
-POINTS = ((1, 2.0), (2, 2.0), (4, 2.0), (8, 2.0), (1, 0.25), (2, 0.25), (1, 8.0), (2, 8.0))
+POINTS = ((1, 2.0), (2, 2.0), (4, 2.0), (8, 2.0), (16, 2.0), (32, 2.0), (1, 0.25), (2, 0.25), (1, 8.0), (2, 8.0))
 """Rollout workers and samples per insert that are measured."""
 COUNTED_S = 10.0
 PICTURE = Path(__file__).parents[2] / "dashboards" / "images" / "service-model.png"
