@@ -6,7 +6,7 @@ that are captured when others surround them, and for M_IN and M_OUT the row *Los
 how long and how often to update or to copy the target network, nor of the robots' size: those are calibrated on seeds
 that no evaluation uses (README of `sim_core`, open questions).
 
-- With a constant rate the last policy depends on when training stops, so trainings differ by 5 to 20 points: take
+- With a constant rate the last policy depends on when training stops, so trainings differ by up to 28 points: take
   several.
 - The target network is copied every 50 updates. With 500 values are still rising when training ends, and neither DQN
   nor Double DQN overestimates.
@@ -53,9 +53,9 @@ TrainingPreset = Literal["thesis", "best", "generalist"]
 """Presets of one training."""
 
 _COMMON: dict[str, Any] = {
-    "total_env_steps": 1_000_000,
-    "learning_rate_decay_env_steps": 1_000_000,
-    "epsilon_decay_env_steps": 200_000,
+    "total_env_steps": 500_000,
+    "learning_rate_decay_env_steps": 500_000,
+    "epsilon_decay_env_steps": 100_000,
     "replay_capacity": 250_000,
     "eval_every_env_steps": 250_000,
     "checkpoint_every_env_steps": 250_000,
@@ -65,24 +65,19 @@ _COMMON: dict[str, Any] = {
 }
 _THESIS: dict[str, Any] = {
     **_COMMON,
-    "total_env_steps": 500_000,
     "epsilon_start": 0.05,
-    "epsilon_decay_env_steps": 100_000,
+    "n_step": 1,
     "loss": "mse",
     "learning_rate_end": 1e-3,
-    "learning_rate_decay_env_steps": 500_000,
     "target_update_interval": 50,
 }
 _BEST: dict[str, Any] = {
     **_COMMON,
-    "total_env_steps": 500_000,
     "discount": 0.97,
     "n_step": 3,
     "samples_per_insert": 8.0,
     "learning_rate": 3e-4,
     "learning_rate_end": 2e-5,
-    "learning_rate_decay_env_steps": 500_000,
-    "epsilon_decay_env_steps": 100_000,
     "replay_capacity": 500_000,
 }
 _GENERALIST: dict[str, Any] = {

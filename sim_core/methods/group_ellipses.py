@@ -233,10 +233,7 @@ POOLED: dict[str, Any] = {"network": "pooled", "teacher_decay_env_steps": 2_000_
 """Settings of training in `generalist`, beside those."""
 MOST_GROUPS = 16
 """Groups that a policy of the preset `generalist` can tell apart."""
-THESIS = Preset(
-    {"n_step": 1, "samples_per_insert": 4.0},
-    {**ELLIPSE_WORLD, "captured_is": "surrounded", "lost_ends_episode": True},
-)
+THESIS = Preset({"samples_per_insert": 4.0}, {**ELLIPSE_WORLD, "captured_is": "surrounded", "lost_ends_episode": True})
 
 
 class EllipseMethod(Method):

@@ -169,7 +169,7 @@ class SensorMethod(Method):
     fits_any_groups = True
     draws = frozenset({"sectors"})
     presets = {
-        "thesis": Preset({"n_step": 1, "samples_per_insert": 1.5}, {**WORLD, "captured_is": "surrounded"}),
+        "thesis": Preset({"samples_per_insert": 1.5}, {**WORLD, "captured_is": "surrounded"}),
         "best": BEST,
         "generalist": GENERALIST,
     }

@@ -10,6 +10,15 @@ MEASURED = {"numba", "torch", "torch._dynamo", "ray", "mlflow", "matplotlib", "z
 """Modules that take more than a tenth of a second to import."""
 KERNELS, TORCH = {"numba"}, {"torch", "torch._dynamo"}
 HELP = "from deploy.cli import main\ntry:\n    main({arguments})\nexcept SystemExit:\n    pass"
+START = """
+import sys
+sys.argv[1:] = ["--help"]
+from deploy.__main__ import main
+try:
+    main()
+except SystemExit:
+    pass
+"""
 WORKER = """
 from actors.rollout.worker import RolloutWorker
 from learner.config import RunConfig
@@ -56,11 +65,16 @@ PROCESSES = {
 """A program for each kind of process, and what it may not import."""
 
 
+def value_after(code, expression):
+    """The value of an expression in a fresh process that has run `code`."""
+    program = f"{code}\nimport gc, json, sys\nsys.__stderr__.write('\\n' + json.dumps({expression}))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300)
+    return json.loads(done.stderr.splitlines()[-1])
+
+
 def modules_after(code):
     """Names of the modules that a fresh process has imported once it has run `code`."""
-    program = f"{code}\nimport json, sys\nsys.__stderr__.write('\\n' + json.dumps(sorted(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300)
-    return set(json.loads(done.stderr.splitlines()[-1]))
+    return set(value_after(code, "sorted(sys.modules)"))
 
 
 @pytest.mark.parametrize("process", PROCESSES)
@@ -77,17 +91,7 @@ def test_what_is_forbidden_is_found_where_it_is_used():
 
 def test_only_the_start_of_shoal_has_python_look_for_cycles_rarely():
     """A process that imports shoal keeps its own garbage collector, and frees what its trainings leave."""
-    program = "import gc, json\nbefore = gc.get_threshold()\n{}\nprint(json.dumps(gc.get_threshold() == before))"
-    programs = {
-        "imported": program.format("import deploy.cli, deploy.commands.train"),
-        "started": program.format(HELP.format(arguments="").replace("deploy.cli", "deploy.__main__")),
-    }
-    unchanged = {
-        name: json.loads(
-            subprocess.run(
-                [sys.executable, "-c", code, "--help"], capture_output=True, text=True, check=True, timeout=300
-            ).stdout.splitlines()[-1]
-        )
-        for name, code in programs.items()
-    }
-    assert unchanged == {"imported": True, "started": False}
+    of_python, imported, started = (
+        value_after(code, "gc.get_threshold()") for code in ("", "import deploy.cli, deploy.commands.train", START)
+    )
+    assert of_python == imported != started
